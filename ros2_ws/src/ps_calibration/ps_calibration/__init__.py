@@ -1,0 +1,1 @@
+"""Half-ring calibration of the head."""

@@ -1,0 +1,1 @@
+"""The head: kinematics, convergence radius, light model, link, cameras, fake hardware."""

@@ -1,0 +1,1 @@
+"""Command-line tools, one file each; the same code as the nodes."""

@@ -1,0 +1,97 @@
+"""Errors with a code: the one exception type that services and actions turn into an answer.
+
+The numbers are those of ps_interfaces/msg/ErrorCode.msg; a test keeps both equal. They are
+repeated here because the pure modules work without ROS.
+"""
+from enum import IntEnum
+
+
+class ErrorCode(IntEnum):
+    """Error codes of every answer; see ps_interfaces/msg/ErrorCode.msg for their meaning."""
+
+    NONE = 0
+    HEAD_DISCONNECTED = 100
+    HEAD_LINK_TIMEOUT = 101
+    HEAD_PROTOCOL_MISMATCH = 102
+    HEAD_NOT_HOMED = 103
+    HEAD_OUT_OF_LIMITS = 104
+    HEAD_BUSY = 105
+    HEAD_STALL = 106
+    HEAD_LIMIT_HIT = 107
+    HEAD_OVER_TEMPERATURE = 108
+    HEAD_LED_OPEN = 109
+    HEAD_WATCHDOG = 110
+    HEAD_BOARD_RESET = 111
+    HEAD_PROGRAM_REJECTED = 112
+    HEAD_PROGRAM_ABORTED = 113
+    HEAD_NOT_ACTIVE = 114
+    HEAD_BAD_REQUEST = 115
+    HEAD_CANCELLED = 116
+    HEAD_NOT_IN_POSITION = 117
+    HEAD_FAULT = 118
+    HEAD_INTERNAL = 199
+    SEQUENCER_BUSY = 200
+    SEQUENCER_UNKNOWN_RECIPE = 201
+    SEQUENCER_BAD_REQUEST = 202
+    SEQUENCER_CAMERA_LOST = 203
+    SEQUENCER_FRAME_MISSING = 204
+    SEQUENCER_FRAME_MISMATCH = 205
+    SEQUENCER_HEAD_FAILED = 206
+    SEQUENCER_CANCELLED = 207
+    SEQUENCER_MOTION = 208
+    SEQUENCER_BAD_IMAGE = 209
+    SEQUENCER_HEAD_UNAVAILABLE = 210
+    SEQUENCER_INTERNAL = 299
+    CR_NO_INTERSECTION = 300
+    CR_UNREACHABLE = 301
+    CR_BAD_REQUEST = 302
+    CR_OUT_OF_LIMITS = 303
+    CR_INTERNAL = 399
+    CALIBRATION_NOT_IMPLEMENTED = 400
+    CALIBRATION_FILE_NOT_FOUND = 401
+    CALIBRATION_FILE_INVALID = 402
+    CALIBRATION_FILE_VERSION = 403
+    CALIBRATION_WRONG_HEAD = 404
+    CALIBRATION_NONE_ACTIVE = 405
+    CALIBRATION_WRITE_FAILED = 406
+    CALIBRATION_BUSY = 407
+    CALIBRATION_BAD_REQUEST = 408
+    CALIBRATION_CANCELLED = 409
+    CALIBRATION_TARGET_NOT_FOUND = 410
+    CALIBRATION_CAPTURE_FAILED = 411
+    CALIBRATION_POOR_FIT = 412
+    CALIBRATION_INTERNAL = 499
+    RECONSTRUCTION_BAD_STACK = 500
+    RECONSTRUCTION_TOO_FEW_LIGHTS = 501
+    RECONSTRUCTION_DEGENERATE_LIGHTS = 502
+    RECONSTRUCTION_BAD_PARAMETER = 503
+    RECONSTRUCTION_TIMEOUT = 504
+    RECONSTRUCTION_INTERNAL = 599
+    SESSION_NOT_RECORDING = 600
+    SESSION_ALREADY_RECORDING = 601
+    SESSION_BAD_REQUEST = 602
+    SESSION_DISK_FULL = 603
+    SESSION_NO_PERMISSION = 604
+    SESSION_WRITE_FAILED = 605
+    SESSION_NOT_A_SESSION = 606
+    SESSION_INTERNAL = 699
+    INSPECTION_BUSY = 700
+    INSPECTION_BAD_REQUEST = 701
+    INSPECTION_CANCELLED = 702
+    INSPECTION_CAPTURE_FAILED = 703
+    INSPECTION_RECONSTRUCTION_FAILED = 704
+    INSPECTION_NOT_IMPLEMENTED = 705
+    INSPECTION_INTERNAL = 799
+
+
+class PsError(Exception):
+    """A failure that the user can act on.
+
+    :param code: what went wrong, for programs.
+    :param message: what went wrong and what to do, for people; names the file, field or parameter.
+    """
+
+    def __init__(self, code: ErrorCode, message: str) -> None:
+        super().__init__(message)
+        self.code = ErrorCode(code)
+        self.message = message

@@ -1,0 +1,1 @@
+"""The inspection cell: launch, configuration, sessions, demo."""

@@ -1,0 +1,1 @@
+"""ROS nodes, one file each: parameters, callbacks, error mapping; nothing computed here."""

@@ -1,0 +1,1 @@
+"""Photometric stereo: normals, slopes, albedo, height, surface measures."""

@@ -1,5 +1,9 @@
-"""Starts the nodes of ps_calibration: ring calibration. Arguments: ``ros2 launch ps_calibration calibration.launch.py --show-args``."""
+"""Starts the ring calibration.
+
+All arguments: ``ros2 launch ps_calibration calibration.launch.py --show-args``.
+"""
 from launch import LaunchDescription
+
 from ps_calibration.graph import NODES
 from ps_head_driver.launch_support import describe
 

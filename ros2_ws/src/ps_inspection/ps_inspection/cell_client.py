@@ -1,0 +1,179 @@
+"""A client of a running cell: the public interfaces as plain blocking calls.
+
+For robot programs, the demo and tests. Everything goes through topics, services and actions, as
+anybody else would use them.
+"""
+from collections.abc import Iterable
+from contextlib import suppress
+import threading
+import time
+from types import TracebackType
+from typing import Any
+
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import Image
+from std_srvs.srv import Trigger
+
+from ps_head_driver import ros_support
+from ps_head_driver.errors import ErrorCode, PsError
+from ps_interfaces import msg as ps
+from ps_interfaces import srv
+
+# output: topic and quality of service are those of the reconstruction node
+OUTPUT_TOPICS = {
+    'slope': 'slope/image', 'normal': 'normal/image', 'albedo': 'albedo/image',
+    'height': 'height/image', 'curvature': 'curvature/image', 'shape': 'shape/image',
+    'confidence': 'confidence/image', 'preview': 'normal/preview',
+}
+
+
+class CellClient:
+    """Blocking access to a cell; use it as a context manager.
+
+    :param namespace: of the cell.
+    :param outputs: keys of OUTPUT_TOPICS to receive; the reconstruction computes only what
+        somebody receives.
+    """
+
+    def __init__(self, namespace: str = 'ps_head', outputs: Iterable[str] = ()) -> None:
+        self._context = Context()
+        self._context.init()
+        self.node = Node('cell_client', namespace=namespace, context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._changed = threading.Condition()
+        self.status: ps.HeadStatus | None = None
+        self.stacks: dict[str, tuple[ps.PhotometricStack, float]] = {}
+        self.done: dict[str, tuple[ps.AcquisitionDone, float]] = {}
+        self.info: dict[str, tuple[ps.ReconstructionInfo, float]] = {}
+        # output -> stamp of the stack -> (message, time of arrival)
+        self.images: dict[str, dict[tuple[int, int], tuple[Image, float]]] = {}
+
+        reliable, latched = ros_support.RELIABLE, ros_support.LATCHED
+        subscribe = self.node.create_subscription
+        subscribe(ps.HeadStatus, 'head_status', self._on_status, latched)
+        subscribe(ps.PhotometricStack, 'stack', self._keeper(self.stacks), reliable)
+        subscribe(ps.AcquisitionDone, 'acquisition_done', self._keeper(self.done), reliable)
+        subscribe(ps.ReconstructionInfo, 'reconstruction_info', self._keeper(self.info), latched)
+        for output in outputs:
+            self.images[output] = {}
+            subscribe(Image, OUTPUT_TOPICS[output], self._image_keeper(output), reliable)
+        self._thread = threading.Thread(target=self._spin, name='ps_cell_client', daemon=True)
+        self._thread.start()
+
+    # ------------------------------------------------------------------ receiving
+
+    def _spin(self) -> None:
+        with suppress(ExternalShutdownException):
+            self._executor.spin()
+
+    def _on_status(self, message: ps.HeadStatus) -> None:
+        with self._changed:
+            self.status = message
+            self._changed.notify_all()
+
+    def _keeper(self, store: dict) -> Any:
+        def keep(message: Any) -> None:
+            with self._changed:
+                store[message.stack_id] = (message, time.monotonic())
+                self._changed.notify_all()
+        return keep
+
+    def _image_keeper(self, output: str) -> Any:
+        def keep(message: Image) -> None:
+            with self._changed:
+                stamp = message.header.stamp
+                self.images[output][stamp.sec, stamp.nanosec] = (message, time.monotonic())
+                self._changed.notify_all()
+        return keep
+
+    def wait(self, condition: Any, timeout: float, what: str) -> Any:
+        """Wait until ``condition()`` gives something true and return it.
+
+        :raises PsError: RECONSTRUCTION_TIMEOUT saying what was waited for.
+        """
+        with self._changed:
+            found = self._changed.wait_for(condition, timeout)
+        if not found:
+            raise PsError(ErrorCode.RECONSTRUCTION_TIMEOUT, f'no {what} within {timeout:g} s')
+        return found
+
+    # ------------------------------------------------------------------ asking
+
+    def call(self, kind: Any, name: str, request: Any = None, timeout: float = 30.0) -> Any:
+        """Call a service of the cell.
+
+        :returns: the response.
+        :raises PsError: the code and message of an answer without success, or that nobody
+            answered.
+        """
+        client = self.node.create_client(kind, name)
+        try:
+            response = ros_support.call(client, request or kind.Request(), timeout,
+                                        ErrorCode.SEQUENCER_HEAD_UNAVAILABLE)
+        finally:
+            self.node.destroy_client(client)
+        if not response.success:
+            raise PsError(getattr(response, 'error_code', ErrorCode.HEAD_FAULT), response.message)
+        return response
+
+    def home(self) -> None:
+        """Home the motor and wait until the head is ready."""
+        self.call(Trigger, 'head_driver/home', timeout=60.0)
+        self.wait(lambda: self.status is not None and self.status.state == ps.HeadStatus.READY,
+                  10.0, 'READY in head_status')
+
+    def solve(self, convergence_radius: float) -> srv.SolveConvergenceRadius.Response:
+        """Ask which motor position gives a convergence radius (m)."""
+        kind = srv.SolveConvergenceRadius
+        return self.call(kind, 'solve_convergence_radius', kind.Request(
+            mode=kind.Request.INVERSE, convergence_radius=convergence_radius))
+
+    def illuminate(self, convergence_radius: float) -> srv.SetIllumination.Response:
+        """Move the panels to a convergence radius (m)."""
+        kind = srv.SetIllumination
+        return self.call(kind, 'set_illumination', kind.Request(
+            by=kind.Request.BY_CONVERGENCE_RADIUS, convergence_radius=convergence_radius))
+
+    def capture(self, recipe: str = '', part_id: str = '', timeout: float = 120.0) -> str:
+        """Take one stack; returns its id."""
+        return self.call(srv.Capture, 'capture', srv.Capture.Request(
+            recipe=recipe, part_id=part_id), timeout).stack_id
+
+    def stack(self, stack_id: str, timeout: float = 30.0) -> ps.PhotometricStack:
+        """The published stack."""
+        return self.wait(lambda: self.stacks.get(stack_id), timeout, f'stack {stack_id}')[0]
+
+    def reconstruction(
+        self, stack_id: str, timeout: float = 120.0,
+    ) -> tuple[ps.ReconstructionInfo, dict[str, Image]]:
+        """Info and the subscribed output images of a stack.
+
+        :raises PsError: the error of a reconstruction that failed.
+        """
+        info = self.wait(lambda: self.info.get(stack_id), timeout,
+                         f'reconstruction of {stack_id}')[0]
+        if not info.success:
+            raise PsError(info.error_code, info.message)
+        stamp = (info.header.stamp.sec, info.header.stamp.nanosec)
+        self.wait(lambda: all(stamp in images for images in self.images.values()), timeout,
+                  f'output images of {stack_id}')
+        return info, {name: images[stamp][0] for name, images in self.images.items()}
+
+    # ------------------------------------------------------------------ life
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._executor.shutdown(timeout_sec=2.0)
+        self._thread.join(timeout=2.0)
+        self.node.destroy_node()
+        self._context.try_shutdown()
+
+    def __enter__(self) -> 'CellClient':
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        self.close()

@@ -2,11 +2,11 @@
 
 For pixel x and frame t the solvers explain the normalised intensity
 
-    v_t(x) = reciprocal_flat_t(x) * sum_c weight_c * min((raw_tc(x) - ambient_c(x)) * scale_tc, clip)
+    v_t(x) = reciprocal_flat_t(x) * sum_c w_c * min((raw_tc(x) - ambient_c(x)) * scale_tc, clip)
 
-by v_t = g . s_t(x) with the scaled normal g = albedo * normal (paper, Eq. 5). The light vectors s_t and
-the flat field are smooth, so both live on a coarse grid of nodes, one every ``step`` pixels, and
-are interpolated linearly between them.
+by v_t = g . s_t(x) with the scaled normal g = albedo * normal (paper, Eq. 5). The light vectors
+s_t and the flat field are smooth, so both live on a coarse grid of nodes, one every ``step``
+pixels, and are interpolated linearly between them.
 """
 from dataclasses import dataclass
 
@@ -86,7 +86,7 @@ class Solution:
 
 
 def grid_size(shape: tuple[int, int], step: int) -> tuple[int, int]:
-    """Number of nodes (gh, gw) that cover an image: at least 2 x 2, last node at or past the last pixel."""
+    """Number of nodes (gh, gw) that cover an image, at least 2 x 2."""
     gh, gw = (max(2, -(-(n - 1) // step) + 1) for n in shape)
     return gh, gw
 
@@ -120,7 +120,7 @@ def expand(grid: NDArray, step: int, shape: tuple[int, int]) -> NDArray[np.float
 
 
 def intensities(problem: Problem) -> NDArray[np.float64]:
-    """Normalised intensities v of every pixel, (H, W, T): the plain form, for tests and oracles."""
+    """Normalised intensities v of every pixel, (H, W, T), in plain form for tests and oracles."""
     stack = np.stack([frame.reshape(*problem.shape, -1) for frame in problem.frames], axis=2)
     values = stack.astype(np.float64)                                            # (H, W, T, C)
     if problem.ambient is not None:

@@ -1,0 +1,340 @@
+"""Photometric least squares for every pixel (paper, Eq. 5 without weights).
+
+Least squares over all frames is linear in the intensities: g = M(x) v with M = pinv(S(x)), 3 x T.
+S is smooth, so M is computed at the grid nodes only and the kernel interpolates M instead of
+solving a 3 x 3 system per pixel; scale, flat field and (as one more frame) the ambient picture
+are folded into M. `solve_reference` is the same mathematics in plain NumPy.
+"""
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from ps_head_driver.errors import ErrorCode, PsError
+from ps_reconstruction.bands import for_bands
+from ps_reconstruction.problem import (
+    FEW_LIGHTS,
+    GREY_WEIGHTS,
+    MASKED,
+    SATURATED,
+    SHADOW,
+    Problem,
+    Solution,
+    expand,
+    intensities,
+)
+
+BAND = 8                      # rows per band: its accumulators stay in the second-level cache
+GROUP = 4                     # frames per pass over the accumulators
+MAX_CONDITION = 1e3           # of the light matrix at any node; a usable ring has 1 to 10
+RESIDUAL_HALF = 0.05          # relative residual that halves the confidence
+DARK = 0.1                    # of albedo x |s|: below it a frame counts as shadowed
+FAST = {'contract', 'reassoc', 'arcp', 'nsz', 'afn'}    # without nnan: NaN marks invalid pixels
+
+
+def solve(problem: Problem, quality: bool = True, out: Solution | None = None) -> Solution:
+    """Normals and albedo by least squares.
+
+    :param quality: also compute confidence, reason and residual_rms (a second pass).
+    :param out: arrays to fill instead of new ones; must fit the problem.
+    :raises PsError: RECONSTRUCTION_TOO_FEW_LIGHTS or RECONSTRUCTION_DEGENERATE_LIGHTS.
+    """
+    height, width = problem.shape
+    channels = 3 if problem.colour else 1
+    result = out if out is not None else empty_solution(problem, quality)
+    albedo = result.albedo.reshape(height, width, channels)
+    weights = np.array(GREY_WEIGHTS if problem.colour else (1.0,), np.float32)
+    inverse = pseudo_inverse(problem.lights)
+    if problem.reciprocal_flat is not None:
+        inverse = inverse * problem.reciprocal_flat[..., None, :]
+    raw = not problem.colour and not np.isfinite(problem.clip)
+    if raw:
+        inverse = inverse * problem.scale[:, 0]
+        if problem.ambient is not None:
+            inverse = np.concatenate([inverse, -inverse.sum(axis=-1, keepdims=True)], axis=-1)
+    groups = _grouped(inverse)
+    forward = _forward(problem, raw)
+
+    def work(first: int, last: int) -> tuple[float, float, int]:
+        rows = slice(first, last)
+        frames = [frame[rows] for frame in problem.frames]
+        ambient = None if problem.ambient is None else problem.ambient[rows]
+        if raw:
+            planes = [frames if ambient is None else [*frames, ambient]]
+        else:
+            planes = _normalised(problem, frames, ambient)
+        scaled_normal = np.zeros((channels, 3, last - first, width), np.float32)
+        for c in range(channels):
+            for i, group in enumerate(groups):
+                # the last group is filled up with a frame that counts nothing
+                chosen = [planes[c][min(GROUP * i + k, len(planes[c]) - 1)] for k in range(GROUP)]
+                _accumulate(*chosen, group, problem.step, first, scaled_normal[c])
+        mask = None if problem.mask is None else problem.mask[rows]
+        if mask is None:
+            _finish(scaled_normal, weights, result.normal[rows], albedo[rows])
+        else:
+            _finish_masked(scaled_normal, weights, mask, result.normal[rows], albedo[rows])
+        if not quality:
+            return 0.0, 0.0, 0
+        grey = np.tensordot(weights, scaled_normal, 1) if problem.colour else scaled_normal[0]
+        tally = np.zeros((3, last - first, width), np.float32)
+        flags = np.zeros((last - first, width), np.uint8)
+        for t, frame in enumerate(frames):
+            level = frame.max(axis=-1) if problem.colour else frame
+            if raw:
+                dark = np.zeros_like(frame) if ambient is None else ambient
+                _compare(frame, dark, level, forward[t], problem.step, first, problem.saturation,
+                         grey, tally, flags)
+            else:
+                value = np.tensordot(weights, [plane[t] for plane in planes], 1)
+                _compare(value, np.zeros_like(value), level, forward[t], problem.step, first,
+                         problem.saturation, grey, tally, flags)
+        assert result.confidence is not None and result.reason is not None
+        squares, brightness, count = _judge(
+            result.normal[rows], tally, flags, problem.count,
+            result.confidence[rows], result.reason[rows])
+        if mask is not None:
+            result.reason[rows][~mask] = MASKED
+        return squares, brightness, count
+
+    squares, brightness, count = np.sum(for_bands(height, BAND, work), axis=0)
+    if quality and problem.count > 3 and count and brightness > 0:
+        result.residual_rms = float(np.sqrt(squares / count) / (brightness / count))
+    return result
+
+
+def solve_reference(problem: Problem) -> Solution:
+    """The same by plain NumPy: light vectors and normal equations of every pixel, float64."""
+    check_lights(problem.lights)
+    value = intensities(problem)                                                 # (H, W, T)
+    lights = expand(problem.lights, problem.step, problem.shape)                 # (H, W, T, 3)
+    normal_matrix = np.einsum('hwti,hwtj->hwij', lights, lights)
+    right_side = np.einsum('hwti,hwt->hwi', lights, value)
+    g = np.linalg.solve(normal_matrix, right_side[..., None])[..., 0]
+    albedo = np.linalg.norm(g, axis=-1)
+    valid = (albedo > 0) & (g[..., 2] > 0)
+    if problem.mask is not None:
+        valid &= problem.mask
+    with np.errstate(divide='ignore', invalid='ignore'):
+        normal = np.where(valid[..., None], g / albedo[..., None], np.nan)
+    albedo = np.where(valid, albedo, np.nan)
+    return Solution(normal.astype(np.float32), albedo.astype(np.float32))
+
+
+def empty_solution(problem: Problem, quality: bool = True) -> Solution:
+    """Arrays of the right shapes, not initialised."""
+    height, width = problem.shape
+    colour = (3,) if problem.colour else ()
+    return Solution(
+        np.empty((height, width, 3), np.float32), np.empty((height, width, *colour), np.float32),
+        np.empty((height, width), np.uint8) if quality else None,
+        np.empty((height, width), np.uint8) if quality else None)
+
+
+def check_lights(lights: NDArray) -> None:
+    """Refuse lights that do not determine a normal.
+
+    :param lights: (..., T, 3).
+    :raises PsError: RECONSTRUCTION_TOO_FEW_LIGHTS or RECONSTRUCTION_DEGENERATE_LIGHTS.
+    """
+    count = lights.shape[-2]
+    if count < 3:
+        raise PsError(ErrorCode.RECONSTRUCTION_TOO_FEW_LIGHTS,
+                      f'{count} frames lit by a single panel; photometric stereo needs at least 3')
+    if not np.all(np.isfinite(lights)):
+        raise PsError(ErrorCode.RECONSTRUCTION_BAD_STACK, 'lights: light vectors are not finite')
+    values = np.linalg.svd(lights, compute_uv=False)
+    condition = float(np.max(values[..., 0] / np.maximum(values[..., 2], 1e-300)))
+    if condition > MAX_CONDITION:
+        raise PsError(ErrorCode.RECONSTRUCTION_DEGENERATE_LIGHTS,
+                      'the light directions lie (nearly) in one plane: condition number '
+                      f'{condition:.3g}, at most {MAX_CONDITION:.0f} is usable')
+
+
+def pseudo_inverse(lights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pseudo-inverse of the light matrix at every node, (gh, gw, T, 3) to (gh, gw, 3, T)."""
+    check_lights(lights)
+    inverse: NDArray[np.float64] = np.linalg.pinv(lights)
+    return inverse
+
+
+def _grouped(inverse: NDArray) -> list[NDArray[np.float32]]:
+    """(gh, gw, 3, T) as contiguous groups (gh, gw, 3, GROUP), the last one filled with zeros."""
+    count = inverse.shape[-1]
+    padded = np.pad(inverse, [(0, 0)] * 3 + [(0, -count % GROUP)])
+    return [np.ascontiguousarray(padded[..., i:i + GROUP], np.float32)
+            for i in range(0, count, GROUP)]
+
+
+def _forward(problem: Problem, raw: bool) -> list[NDArray[np.float32]]:
+    """Per frame (gh, gw, 4): light vector, and the factor from counts to intensity."""
+    factor = np.ones(problem.lights.shape[:3])
+    if problem.reciprocal_flat is not None:
+        factor = factor * problem.reciprocal_flat
+    if raw:
+        factor = factor * problem.scale[:, 0]
+    both = np.concatenate([problem.lights, factor[..., None]], axis=-1).astype(np.float32)
+    return [np.ascontiguousarray(both[:, :, t]) for t in range(problem.count)]
+
+
+def _normalised(problem: Problem, frames: list[NDArray], ambient: NDArray | None,
+                ) -> list[list[NDArray[np.float32]]]:
+    """Scaled and clipped channels of a band: C lists of T planes (h, W) float32."""
+    channels = 3 if problem.colour else 1
+    planes = np.empty((len(frames), channels, *frames[0].shape[:2]), np.float32)
+    for frame, scale, plane in zip(frames, problem.scale, planes, strict=True):
+        values = frame.reshape(*frame.shape[:2], channels).astype(np.float32)
+        if ambient is not None:
+            values -= ambient.reshape(values.shape)
+        values *= scale.astype(np.float32)
+        np.minimum(values, np.float32(problem.clip), out=values)
+        plane[...] = values.transpose(2, 0, 1)
+    return [list(planes[:, c]) for c in range(channels)]
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def _accumulate(f0, f1, f2, f3, matrix, step, first, total):    # type: ignore[no-untyped-def]
+    """Add M v of four frames to the scaled normals ``total`` (3, h, W) of the rows from ``first``.
+
+    :param matrix: (gh, gw, 3, 4) float32 at the nodes.
+    """
+    rows, width = f0.shape
+    m = np.empty((2, 3, 4), np.float32)
+    for y in range(rows):
+        i = (first + y) // step
+        fy = np.float32((first + y) - i * step) / np.float32(step)
+        for j in range((width - 1) // step + 1):
+            for side in range(2):
+                for a in range(3):
+                    for t in range(4):
+                        top = matrix[i, j + side, a, t]
+                        m[side, a, t] = top + fy * (matrix[i + 1, j + side, a, t] - top)
+            begin = j * step
+            end = min(begin + step, width)
+            c0, c1, c2, c3 = f0[y, begin:end], f1[y, begin:end], f2[y, begin:end], f3[y, begin:end]
+            for a in range(3):
+                target = total[a, y, begin:end]
+                m0, m1, m2, m3 = m[0, a, 0], m[0, a, 1], m[0, a, 2], m[0, a, 3]
+                d0 = (m[1, a, 0] - m0) / np.float32(step)
+                d1 = (m[1, a, 1] - m1) / np.float32(step)
+                d2 = (m[1, a, 2] - m2) / np.float32(step)
+                d3 = (m[1, a, 3] - m3) / np.float32(step)
+                for x in range(end - begin):
+                    k = np.float32(x)
+                    target[x] += ((m0 + k * d0) * np.float32(c0[x])
+                                  + (m1 + k * d1) * np.float32(c1[x])
+                                  + (m2 + k * d2) * np.float32(c2[x])
+                                  + (m3 + k * d3) * np.float32(c3[x]))
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def _finish(total, weights, normal, albedo):    # type: ignore[no-untyped-def]
+    """Unit normals and albedo of a band from its scaled normals (C, 3, h, W).
+
+    Albedo of a channel: its scaled normal projected on the common normal.
+    """
+    channels, _, rows, width = total.shape
+    nan = np.float32(np.nan)
+    one = np.float32(1)
+    for y in range(rows):
+        if channels == 1:
+            gx, gy, gz = total[0, 0, y], total[0, 1, y], total[0, 2, y]
+            row, reflectance = normal[y], albedo[y]
+            for x in range(width):
+                length = np.sqrt(gx[x] * gx[x] + gy[x] * gy[x] + gz[x] * gz[x])
+                inverse = one / length if gz[x] > 0 else nan
+                row[x, 0] = gx[x] * inverse
+                row[x, 1] = gy[x] * inverse
+                row[x, 2] = gz[x] * inverse
+                reflectance[x, 0] = length if gz[x] > 0 else nan
+        else:
+            for x in range(width):
+                sx, sy, sz = np.float32(0), np.float32(0), np.float32(0)
+                for c in range(channels):
+                    sx += weights[c] * total[c, 0, y, x]
+                    sy += weights[c] * total[c, 1, y, x]
+                    sz += weights[c] * total[c, 2, y, x]
+                length = np.sqrt(sx * sx + sy * sy + sz * sz)
+                inverse = one / length if sz > 0 else nan
+                sx, sy, sz = sx * inverse, sy * inverse, sz * inverse
+                normal[y, x, 0], normal[y, x, 1], normal[y, x, 2] = sx, sy, sz
+                for c in range(channels):
+                    albedo[y, x, c] = (sx * total[c, 0, y, x] + sy * total[c, 1, y, x]
+                                       + sz * total[c, 2, y, x])
+
+
+def _finish_masked(total: NDArray, weights: NDArray, mask: NDArray, normal: NDArray,
+                   albedo: NDArray) -> None:
+    _finish(total, weights, normal, albedo)
+    normal[~mask] = np.nan
+    albedo[~mask] = np.nan
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def _compare(frame, ambient, level, forward, step, first, saturation, total, tally, flags):    # type: ignore[no-untyped-def]
+    """Compare one frame of a band with what its scaled normals (3, h, W) predict.
+
+    :param forward: (gh, gw, 4) float32, light vector and factor at the nodes.
+    :param level: (h, W) raw counts to hold against ``saturation``.
+    :param tally: (3, h, W), adds: squared residual; intensity; 1 if the frame cannot be trusted.
+    :param flags: (h, W) uint8, gets SHADOW and SATURATED.
+    """
+    rows, width = frame.shape
+    node = np.empty((2, 4), np.float32)
+    for y in range(rows):
+        i = (first + y) // step
+        fy = np.float32((first + y) - i * step) / np.float32(step)
+        for j in range((width - 1) // step + 1):
+            for side in range(2):
+                for a in range(4):
+                    top = forward[i, j + side, a]
+                    node[side, a] = top + fy * (forward[i + 1, j + side, a] - top)
+            s0, s1, s2, s3 = node[0]
+            d0 = (node[1, 0] - s0) / np.float32(step)
+            d1 = (node[1, 1] - s1) / np.float32(step)
+            d2 = (node[1, 2] - s2) / np.float32(step)
+            d3 = (node[1, 3] - s3) / np.float32(step)
+            begin = j * step
+            for x in range(begin, min(begin + step, width)):
+                k = np.float32(x - begin)
+                sx, sy, sz = s0 + k * d0, s1 + k * d1, s2 + k * d2
+                gx, gy, gz = total[0, y, x], total[1, y, x], total[2, y, x]
+                value = (np.float32(frame[y, x]) - np.float32(ambient[y, x])) * (s3 + k * d3)
+                residual = value - (gx * sx + gy * sy + gz * sz)
+                dark = value * value < np.float32(DARK * DARK) * (
+                    (gx * gx + gy * gy + gz * gz) * (sx * sx + sy * sy + sz * sz))
+                dark = dark or value <= 0
+                saturated = level[y, x] >= saturation
+                tally[0, y, x] += residual * residual
+                tally[1, y, x] += value
+                tally[2, y, x] += np.float32(1) if dark or saturated else np.float32(0)
+                flags[y, x] |= (np.uint8(SHADOW) if dark else np.uint8(0)) | (
+                    np.uint8(SATURATED) if saturated else np.uint8(0))
+
+
+@numba.njit(nogil=True, cache=True, error_model='numpy')
+def _judge(normal, tally, flags, count, confidence, reason):    # type: ignore[no-untyped-def]
+    """Confidence and reason of a band; returns the sums behind residual_rms."""
+    rows, width = flags.shape
+    squares, brightness, valid = 0.0, 0.0, 0
+    for y in range(rows):
+        for x in range(width):
+            reason[y, x] = flags[y, x]
+            if np.isnan(normal[y, x, 2]):
+                confidence[y, x] = 0
+                reason[y, x] |= FEW_LIGHTS
+                continue
+            mean = tally[1, y, x] / count
+            variance = tally[0, y, x] / max(count - 3, 1)
+            squares += variance
+            brightness += mean
+            valid += 1
+            usable = count - tally[2, y, x]
+            score = usable / count
+            if count > 3:
+                relative = variance / max(mean * mean, np.float32(1e-20))
+                score /= 1 + relative / (RESIDUAL_HALF * RESIDUAL_HALF)
+            if usable < 3:
+                reason[y, x] |= FEW_LIGHTS
+                score *= 0.25
+            confidence[y, x] = max(1, int(255 * score + 0.5))
+    return squares, brightness, valid

@@ -3,9 +3,15 @@ from pathlib import Path
 import threading
 import time
 
-from ps_head_driver.fake.trigger_socket import (
-    ControlClient, default_path, StrobeEvent, TriggerListener, TriggerServer)
 import pytest
+
+from ps_head_driver.fake.trigger_socket import (
+    ControlClient,
+    StrobeEvent,
+    TriggerListener,
+    TriggerServer,
+    default_path,
+)
 
 EVENT = StrobeEvent(
     strobe_counter=3, trigger_counter=5, device_time_ns=123456789, strobe_s=0.004,

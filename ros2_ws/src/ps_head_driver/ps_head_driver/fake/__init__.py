@@ -1,0 +1,1 @@
+"""Fake hardware, one level below the driver: a firmware emulator, and the light that it makes."""

@@ -1,0 +1,1 @@
+"""Camera back ends behind one small interface: fake, folder, topic."""

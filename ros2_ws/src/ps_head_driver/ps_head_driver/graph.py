@@ -82,6 +82,7 @@ _HANDED_ON = {argument.name: argument for argument in (
              ('', 'fake', 'folder', 'topic')),
     Argument('input_folder', '', 'stack or four-direction folder that camera:=folder plays'),
     Argument('scene', '', 'scene that camera:=fake renders'),
+    Argument('calibration_file', '', 'head calibration that is active from the start'),
     Argument('session_folder', '', 'folder that sessions are recorded into'),
 )}
 

@@ -1,0 +1,223 @@
+"""Crank-slider kinematics of the bright-field panels and the servo tilt of the dark-field panels.
+
+All in ps_head_plane (x right, y up, z towards the camera), metres and radians. The crank-slider of
+one panel moves in the plane through the optical axis at the panel's azimuth; (r, z) are its
+coordinates there (paper, section 2.1).
+"""
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ps_head_driver.errors import ErrorCode, PsError
+from ps_head_driver.head_model import (
+    DIRECTIONS, BrightField, DarkField, Direction, HeadModel, PanelTolerance)
+from ps_head_driver.stack import Light, Mode, Panel
+
+# closer to a dead point than this (rad of crank angle) the tilt is not defined by the motor
+DEAD_POINT_MARGIN = 1e-3
+
+
+@dataclass(frozen=True)
+class PanelPose:
+    """Where one panel is: centre (3,), unit axis out of its face (3,), unit width direction (3,)."""
+
+    center: NDArray
+    axis: NDArray
+    right: NDArray
+    size: tuple[float, float]      # width, height, m
+    lobe_exponent: float
+    intensity: float
+
+
+class BrightFieldKinematics:
+    """Loop closure of the crank-slider: tilt from motor counts and back, exactly.
+
+    The assembly branch is the one on which the head is at ``m0_counts``; the range of the motor is
+    cut off at dead points (rod and crank collinear), so a branch is never silently crossed.
+
+    :raises PsError: HEAD_BAD_REQUEST if the parts cannot be assembled at ``m0_counts``.
+    """
+
+    def __init__(self, head: HeadModel) -> None:
+        field = head.bright_field
+        self._hinge = np.array([field.hinge.r, field.hinge.z])
+        self._radius, self._offset = field.crank.radius, field.crank.offset
+        self._rod, self._slider = field.rod_length, field.slider
+        self._dz_dm = field.slider.direction / field.slider.counts_per_metre
+        self._dx = field.slider.r - field.hinge.r
+        try:
+            candidates = [self._crank_angle(self._height(field.slider.m0_counts), branch)
+                          for branch in (-1, 1)]
+        except PsError as error:
+            raise PsError(ErrorCode.HEAD_BAD_REQUEST,
+                          f'{head.name}: bright_field: crank, rod and slider cannot be assembled '
+                          'at m0_counts') from error
+        tilts = [_wrap(angle - self._offset) for angle in candidates]
+        # slider above the pin, and of two such the one nearer to facing down
+        low, high = field.tilt_range
+        middle = 0.0 if low <= 0.0 <= high else (low + high) / 2
+        self._branch = (-1, 1)[int(np.argmin([abs(tilt - middle) for tilt in tilts]))]
+        self._turns = self._crank_angle(self._height(field.slider.m0_counts), self._branch)
+        self._turns -= _wrap(self._turns - self._offset) + self._offset
+        self.limits_counts = self._usable_interval()
+
+    def _height(self, m_counts: ArrayLike) -> Any:
+        return self._slider.z_at_m0 + self._dz_dm * (
+            np.asarray(m_counts, np.float64) - self._slider.m0_counts)
+
+    def _crank_angle(self, slider_z: ArrayLike, branch: int) -> Any:
+        """Angle a of the pin, pin = hinge + radius (cos a, -sin a), on one assembly branch."""
+        dz = np.asarray(slider_z, np.float64) - self._hinge[1]
+        distance = np.hypot(self._dx, dz)
+        cosine = (self._radius**2 + distance**2 - self._rod**2) / (2 * self._radius * distance)
+        if np.any(np.abs(cosine) > 1):
+            raise PsError(ErrorCode.CR_OUT_OF_LIMITS,
+                          'the rod does not reach from the slider to the crank there')
+        return branch * np.arccos(cosine) - np.arctan2(dz, self._dx)
+
+    def _usable_interval(self) -> tuple[int, int]:
+        """Soft limits, cut off at the tilt range and before the next dead points."""
+        low, high = self._slider.limits_counts
+        counts = np.unique(np.linspace(low, high, 4097).round()).astype(np.int64)
+        dz = self._height(counts) - self._hinge[1]
+        distance = np.hypot(self._dx, dz)
+        cosine = (self._radius**2 + distance**2 - self._rod**2) / (2 * self._radius * distance)
+        away = np.arccos(np.clip(cosine, -1, 1))
+        usable = (np.abs(cosine) <= 1) & (away > DEAD_POINT_MARGIN) & (
+            away < math.pi - DEAD_POINT_MARGIN)
+        start = int(np.argmin(np.abs(counts - self._slider.m0_counts)))
+        if not usable[start]:
+            raise PsError(ErrorCode.HEAD_BAD_REQUEST,
+                          'bright_field: m0_counts is at a dead point of the crank')
+        blocked = np.flatnonzero(~usable)
+        first = blocked[blocked < start].max(initial=-1) + 1
+        last = blocked[blocked > start].min(initial=len(counts)) - 1
+        return int(counts[first]), int(counts[last])
+
+    def check_counts(self, m_counts: ArrayLike) -> None:
+        """Refuse motor counts outside the usable interval.
+
+        :raises PsError: CR_OUT_OF_LIMITS with the interval.
+        """
+        m = np.asarray(m_counts)
+        low, high = self.limits_counts
+        if np.any(m < low) or np.any(m > high):
+            raise PsError(ErrorCode.CR_OUT_OF_LIMITS,
+                          f'motor counts {np.min(m)} to {np.max(m)} are outside {low} to {high}'
+                          if m.size > 1 else
+                          f'motor counts {int(m)} are outside {low} to {high}')
+
+    def tilt(self, m_counts: ArrayLike) -> Any:
+        """Nominal tilt of all four panels, rad; 0 faces straight down.
+
+        :param m_counts: scalar or array.
+        :raises PsError: CR_OUT_OF_LIMITS.
+        """
+        self.check_counts(m_counts)
+        angle = self._crank_angle(self._height(m_counts), self._branch)
+        return angle - self._offset - self._turns
+
+    def dtilt_dm(self, m_counts: ArrayLike) -> Any:
+        """Exact derivative of the tilt, rad per count."""
+        self.check_counts(m_counts)
+        z = self._height(m_counts)
+        angle = self._crank_angle(z, self._branch)
+        dz = z - self._hinge[1]
+        sine, cosine = np.sin(angle), np.cos(angle)
+        return -(dz + self._radius * sine) / (
+            self._radius * (sine * self._dx + cosine * dz)) * self._dz_dm
+
+    def motor_position(self, tilt: ArrayLike) -> Any:
+        """Motor counts for a tilt, not rounded.
+
+        :raises PsError: HEAD_OUT_OF_LIMITS if the tilt cannot be reached.
+        """
+        angle = np.asarray(tilt, np.float64) + self._offset
+        pin_r = self._hinge[0] + self._radius * np.cos(angle)
+        pin_z = self._hinge[1] - self._radius * np.sin(angle)
+        below = self._rod**2 - (self._slider.r - pin_r)**2
+        if np.all(below >= 0):
+            m = self._slider.m0_counts + (
+                pin_z + np.sqrt(below) - self._slider.z_at_m0) / self._dz_dm
+            low, high = self.limits_counts
+            if np.all((m >= low - 0.5) & (m <= high + 0.5)):
+                m = np.clip(m, low, high)
+                if np.allclose(self.tilt(m), tilt, rtol=0, atol=1e-4):
+                    return m
+        low, high = self.tilt_limits
+        raise PsError(ErrorCode.HEAD_OUT_OF_LIMITS,
+                      f'tilt {np.degrees(np.max(tilt)):.2f} deg cannot be reached; the motor '
+                      f'covers {math.degrees(low):.2f} to {math.degrees(high):.2f} deg')
+
+    def motor_counts(self, tilt: float) -> int:
+        """Motor counts nearest to a tilt (rad)."""
+        return int(np.round(self.motor_position(tilt)))
+
+    @property
+    def tilt_limits(self) -> tuple[float, float]:
+        """Smallest and largest tilt the motor reaches, rad."""
+        ends = [float(self.tilt(m)) for m in self.limits_counts]
+        return min(ends), max(ends)
+
+
+def panel_pose(field: BrightField | DarkField, direction: Direction, tilt: float) -> PanelPose:
+    """Pose of one panel of a ring at a nominal tilt.
+
+    Its own tolerances come on top: ``tilt_offset`` adds to the tilt, ``twist`` turns it about the
+    vertical through the hinge, ``shift`` moves it along its radial, tangential and z axes.
+
+    :param tilt: rad; axis = -sin(tilt) radial - cos(tilt) z.
+    """
+    own: PanelTolerance = field.panels[direction]
+    radial = np.array([math.cos(own.azimuth), math.sin(own.azimuth), 0.0])
+    tangential = np.array([-math.sin(own.azimuth), math.cos(own.azimuth), 0.0])
+    vertical = np.array([0.0, 0.0, 1.0])
+    angle = tilt + own.tilt_offset
+    axis = -math.sin(angle) * radial - math.cos(angle) * vertical
+    along = math.cos(angle) * radial - math.sin(angle) * vertical
+    if isinstance(field, BrightField):
+        hinge = field.hinge.r * radial + field.hinge.z * vertical
+        arm = field.arm.along * along + field.arm.out * axis
+    else:
+        hinge = field.pivot.r * radial + field.pivot.z * vertical
+        arm = np.zeros(3)
+    c, s = math.cos(own.twist), math.sin(own.twist)
+    twist = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    shift = own.shift[0] * radial + own.shift[1] * tangential + own.shift[2] * vertical
+    return PanelPose(
+        center=hinge + twist @ arm + shift, axis=twist @ axis, right=twist @ tangential,
+        size=field.panel_size, lobe_exponent=field.lobe_exponent, intensity=own.intensity)
+
+
+def lights_at(head: HeadModel, m_counts: int, dark_field_tilt: float) -> list[Light]:
+    """The eight panels, BF E N W S then DF E N W S, at one position of the head.
+
+    :param m_counts: motor counts.
+    :param dark_field_tilt: rad.
+    :raises PsError: CR_OUT_OF_LIMITS.
+    """
+    tilt = float(BrightFieldKinematics(head).tilt(m_counts))
+    lights = []
+    for mode, prefix, field, angle in (
+            (Mode.BRIGHT_FIELD, 'BF', head.bright_field, tilt),
+            (Mode.DARK_FIELD, 'DF', head.dark_field, dark_field_tilt)):
+        for name in DIRECTIONS:
+            pose = panel_pose(field, name, angle)  # type: ignore[arg-type]
+            lights.append(Light(
+                name=f'{prefix}_{name}', mode=mode, panel=Panel[name],
+                position=_vector(pose.center), axis=_vector(pose.axis), right=_vector(pose.right),
+                size=pose.size, lobe_exponent=pose.lobe_exponent, intensity=pose.intensity,
+                motor_counts=int(m_counts), tilt=angle))
+    return lights
+
+
+def _vector(array: NDArray) -> tuple[float, float, float]:
+    return float(array[0]), float(array[1]), float(array[2])
+
+
+def _wrap(angle: Any) -> Any:
+    """Angle in (-pi, pi]."""
+    return -((-angle + math.pi) % (2 * math.pi) - math.pi)

@@ -42,7 +42,7 @@ class BrightFieldKinematics:
     """
 
     def __init__(self, head: HeadModel) -> None:
-        field = head.bright_field
+        self._field = field = head.bright_field
         self._hinge = np.array([field.hinge.r, field.hinge.z])
         self._radius, self._offset = field.crank.radius, field.crank.offset
         self._rod, self._slider = field.rod_length, field.slider
@@ -161,6 +161,22 @@ class BrightFieldKinematics:
         """Smallest and largest tilt the motor reaches, rad."""
         ends = [float(self.tilt(m)) for m in self.limits_counts]
         return min(ends), max(ends)
+
+    def panel_pose(self, direction: Direction, tilt: float) -> PanelPose:
+        """Pose of one panel at a nominal tilt (rad), its own tolerances included."""
+        return panel_pose(self._field, direction, tilt)
+
+
+class DarkFieldKinematics:
+    """The dark-field panels, turned about their pivots by a servo."""
+
+    def __init__(self, head: HeadModel) -> None:
+        self._field = head.dark_field
+        self.tilt_limits = head.dark_field.tilt_range
+
+    def panel_pose(self, direction: Direction, tilt: float) -> PanelPose:
+        """Pose of one panel at a nominal tilt (rad), its own tolerances included."""
+        return panel_pose(self._field, direction, tilt)
 
 
 def panel_pose(field: BrightField | DarkField, direction: Direction, tilt: float) -> PanelPose:

@@ -1,7 +1,7 @@
 """Process environment that lets large image stacks travel fast; the one place where it is stated.
 
-Used by the launch file, `ps_cell` and, through `python environment.py`, by env.sh. Only the standard
-library, so that it runs before anything is set up. What the user has set already is kept.
+Used by the launch file, `ps_cell` and, through `python environment.py`, by env.sh. Only the
+standard library, so that it runs without any package. What the user has set already is kept.
 """
 from collections.abc import Mapping
 import os
@@ -28,9 +28,9 @@ def fastdds_profile() -> Path:
 def cell_environment(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
     """Return the variables every process of the cell runs with, name to value.
 
-    * FASTRTPS_DEFAULT_PROFILES_FILE (the name Fast DDS 2.x reads): shared memory for large messages.
-    * MALLOC_MMAP_MAX_, MALLOC_TRIM_THRESHOLD_ (glibc): keep freed image buffers, because mapping and
-      zeroing fresh pages for every stack costs more than copying it.
+    * FASTRTPS_DEFAULT_PROFILES_FILE (the name Fast DDS 2.x reads): shared memory for stacks.
+    * MALLOC_MMAP_MAX_, MALLOC_TRIM_THRESHOLD_ (glibc): keep freed image buffers, because mapping
+      and zeroing fresh pages for every stack costs more than copying it.
     """
     defaults = {
         'FASTRTPS_DEFAULT_PROFILES_FILE': str(fastdds_profile()),

@@ -298,7 +298,8 @@ def write_local_setup(ros: Path | None) -> None:
         lines = ['# ROS as it was sourced at set-up, for shells that have not sourced it',
                  f'[ -n "${{ROS_DISTRO:-}}" ] || . {shlex.quote(str(ros / "setup.sh"))}']
     else:
-        lines = []
+        lines = ['[ -z "${ROS_DISTRO:-}" ] || echo "env.sh: .venv was made without the ROS '
+                 'that is sourced now; run make setup" >&2']
         for name in ('AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH'):
             lines += [f'case ":${{{name}:-}}:" in *:{shlex.quote(str(VENV))}:*) ;; *)',
                       f'  export {name}={shlex.quote(str(VENV))}${{{name}:+:${name}}} ;;', 'esac']

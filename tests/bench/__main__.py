@@ -1,4 +1,4 @@
-"""Run every tests/bench/bench_*.py, or those whose names are given: `python -m tests.bench stv`."""
+"""Run every tests/bench/bench_*.py, or those named: `python -m tests.bench stv`."""
 import importlib.util
 from pathlib import Path
 import sys
@@ -7,7 +7,8 @@ import sys
 def run(path: Path) -> None:
     """Load one benchmark file by its path and call its main(), which prints one table."""
     spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[path.stem] = module
     spec.loader.exec_module(module)

@@ -41,7 +41,7 @@ from ps_head_driver.protocol import (
 )
 
 FIRMWARE = (0, 1, 0)
-WATCHDOG_US = 300_000
+WATCHDOG_US = 350_000
 TICK_US = round(TICK_S * 1e6)
 BOTH = Capability.MOTOR | Capability.LIGHTS
 

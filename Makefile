@@ -15,8 +15,9 @@ help:  ## say what there is
 	@sed -n 's/^#   /  /p' Makefile
 
 setup:  ## make .venv and build the workspace (the others do this by themselves)
-	@command -v $(BOOTSTRAP) >/dev/null || \
-	  { echo 'setup: no $(BOOTSTRAP) found: sudo apt install python3 python3-venv python3-dev' >&2; exit 1; }
+	@$(BOOTSTRAP) -c 'import sys; sys.exit(sys.version_info < (3, 7))' 2>/dev/null || \
+	  { echo 'setup: $(BOOTSTRAP) is missing or too old; Python 3.11 or newer is needed:' \
+	    'sudo apt install python3 python3-venv python3-dev' >&2; exit 1; }
 	@PYTHON='$(PYTHON)' $(BOOTSTRAP) scripts/setup.py
 
 demo: setup  ## run the whole cell on fake hardware and write build/demo/report.html

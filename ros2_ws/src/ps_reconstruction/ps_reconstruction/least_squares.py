@@ -88,7 +88,8 @@ def solve(problem: Problem, quality: bool = True, out: Solution | None = None) -
                 value = np.tensordot(weights, [plane[t] for plane in planes], 1)
                 _compare(value, np.zeros_like(value), level, forward[t], problem.step, first,
                          problem.saturation, grey, tally, flags)
-        assert result.confidence is not None and result.reason is not None
+        assert result.confidence is not None
+        assert result.reason is not None
         squares, brightness, count = _judge(
             result.normal[rows], tally, flags, problem.count,
             result.confidence[rows], result.reason[rows])
@@ -107,10 +108,10 @@ def solve_reference(problem: Problem) -> Solution:
     check_lights(problem.lights)
     value = intensities(problem)                                                 # (H, W, T)
     lights = expand(problem.lights, problem.step, problem.shape)                 # (H, W, T, 3)
-    normal_matrix = np.einsum('hwti,hwtj->hwij', lights, lights)
-    right_side = np.einsum('hwti,hwt->hwi', lights, value)
+    normal_matrix: NDArray = np.einsum('hwti,hwtj->hwij', lights, lights)
+    right_side: NDArray = np.einsum('hwti,hwt->hwi', lights, value)
     g = np.linalg.solve(normal_matrix, right_side[..., None])[..., 0]
-    albedo = np.linalg.norm(g, axis=-1)
+    albedo: NDArray = np.linalg.norm(g, axis=-1)
     valid = (albedo > 0) & (g[..., 2] > 0)
     if problem.mask is not None:
         valid &= problem.mask

@@ -26,7 +26,7 @@ class Problem:
     :param frames: T contiguous arrays (H, W) or (H, W, 3) of one dtype: uint8, uint16, float32.
     :param lights: (gh, gw, T, 3) float64, light vectors of the normalised intensities at the
         grid nodes, in ps_head_plane axes. Node (i, j) lies at pixel row i * step, column j * step;
-        the grid covers the image. Equal nodes make a distant light.
+        the grid has the size of `grid_size`. Equal nodes make a distant light.
     :param step: node distance in pixels.
     :param scale: (T, C) float64, factor from raw counts to normalised intensity (full scale,
         exposure; per channel the light's colour). C is 1 or 3.
@@ -86,9 +86,8 @@ class Solution:
 
 
 def grid_size(shape: tuple[int, int], step: int) -> tuple[int, int]:
-    """Number of nodes (gh, gw) that cover an image, at least 2 x 2."""
-    gh, gw = (max(2, -(-(n - 1) // step) + 1) for n in shape)
-    return gh, gw
+    """Number of nodes (gh, gw) of a grid with at least one node past the last pixel."""
+    return (shape[0] - 1) // step + 2, (shape[1] - 1) // step + 2
 
 
 def constant_lights(vectors: NDArray, shape: tuple[int, int]) -> tuple[NDArray[np.float64], int]:

@@ -1,0 +1,277 @@
+"""Height from normals: the exact perspective gradient field and its fast Poisson solution.
+
+With X = x_n (D - z), Y = y_n (D - z) along the ray (x_n, y_n) of a pixel and w = ln(D - z), D the
+camera standoff, the surface gives, without approximation and whatever the lens distortion,
+
+    dw/du = (n_x dx_n/du + n_y dy_n/du) / (n_z - n_x x_n - n_y y_n)      (v likewise)
+
+so one linear integration yields w up to a constant; the constant is a scale of D - z and is fixed
+by laying the median of the surface on the reference plane. Photometric stereo cannot know it.
+"""
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+import scipy.fft
+
+from ps_reconstruction.bands import core_count, for_bands
+
+BAND = 32
+FAST = {'contract', 'reassoc', 'arcp', 'nsz', 'afn'}
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Where the pixels look: (x_n, y_n) in ps_head_plane axes per metre of depth, at grid nodes.
+
+    :param nodes: (gh, gw, 2) float64; node (i, j) at pixel row i * step, column j * step.
+    :param standoff: camera centre above the origin of ps_head_plane, m. Infinity is a parallel
+        projection; then nodes are metres on the plane.
+    """
+
+    nodes: NDArray[np.float64]
+    step: int
+    standoff: float
+
+
+def parallel_rays(shape: tuple[int, int], pitch: float) -> Rays:
+    """Parallel projection with square pixels of the given pitch (m), origin at the centre."""
+    step = max(2, *shape)
+    x = (np.array([0.0, step]) - (shape[1] - 1) / 2) * pitch
+    y = -(np.array([0.0, step]) - (shape[0] - 1) / 2) * pitch
+    return Rays(np.stack(np.meshgrid(x, y), axis=-1), step, float('inf'))
+
+
+def height_from_normals(
+    normal: NDArray[np.float32], rays: Rays,
+    plane_normal: tuple[float, float, float] = (0.0, 0.0, 1.0), plane_offset: float = 0.0,
+    solver: Callable[[NDArray, NDArray], NDArray] | None = None,
+) -> NDArray[np.float32]:
+    """Height above the plane n . x = offset, metres; its median is zero.
+
+    :param normal: (H, W, 3) float32, n_plane; NaN where invalid.
+    :param solver: turns (dw/du, dw/dv) at the pixels into w; the fast Poisson solver if None.
+    :returns: (H, W) float32, NaN where the normal is.
+    """
+    du, dv = gradients(normal, rays)
+    w = (solver or poisson)(du, dv)
+    return _metric(w, normal, rays, plane_normal, plane_offset)
+
+
+def gradients(normal: NDArray[np.float32], rays: Rays
+              ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(dw/du, dw/dv) at every pixel; (dz/du, dz/dv) for a parallel projection.
+
+    :returns: two (H, W) float32 arrays, NaN where the normal is or the surface is edge-on.
+    """
+    du, dv = (np.empty(normal.shape[:2], np.float32) for _ in range(2))
+    parallel = not np.isfinite(rays.standoff)
+    nodes = rays.nodes.astype(np.float32)
+
+    def work(first: int, last: int) -> None:
+        rows = slice(first, last)
+        _gradient_rows(normal[rows], nodes, rays.step, first, parallel, du[rows], dv[rows])
+
+    for_bands(len(normal), BAND, work)
+    return du, dv
+
+
+def poisson(du: NDArray[np.float32], dv: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Least-squares integral of a gradient field by cosine transforms (Neumann borders).
+
+    :param du: (H, W) derivative along the columns axis at the pixels, NaN counts as 0.
+    :param dv: (H, W) derivative along the rows axis.
+    :returns: (H, W) float32 with zero mean.
+    """
+    return solve_poisson(divergence(du, dv))
+
+
+def divergence(du: NDArray[np.float32], dv: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Right side of the Poisson equation: the gradient between neighbours is their mean."""
+    out = np.empty(du.shape, np.float32)
+
+    def work(first: int, last: int) -> None:
+        _divergence_rows(du, dv, first, last, out)
+
+    for_bands(len(du), BAND, work)
+    return out
+
+
+def solve_poisson(right: NDArray[np.float32], response: NDArray | None = None
+                  ) -> NDArray[np.float32]:
+    """Solve the five-point Laplace equation with Neumann borders.
+
+    :param right: (H, W) float32; overwritten.
+    :param response: (H, W) factors on the cosine spectrum (a filter), or None.
+    """
+    workers = core_count()
+    spectrum = scipy.fft.dctn(right, type=2, overwrite_x=True, workers=workers)
+    column, row = (laplace_eigenvalues(n).astype(np.float32) for n in spectrum.shape)
+
+    def work(first: int, last: int) -> None:
+        _divide_rows(spectrum[first:last], column[first:last], row)
+
+    for_bands(len(spectrum), BAND, work)
+    if response is not None:
+        spectrum *= response
+    result: NDArray[np.float32] = scipy.fft.idctn(
+        spectrum, type=2, overwrite_x=True, workers=workers)
+    return result
+
+
+def laplace_eigenvalues(n: int) -> NDArray[np.float64]:
+    """Eigenvalues of the second difference with Neumann borders, (n,), all <= 0."""
+    return -4 * np.sin(np.pi * np.arange(n) / (2 * n)) ** 2
+
+
+def remove_plane(height: NDArray[np.float32], rounds: int = 3) -> NDArray[np.float32]:
+    """Subtract the plane that fits most of the surface (robust, on a subsample).
+
+    :param height: (H, W), NaN where invalid.
+    """
+    step = max(1, int(np.sqrt(height.size / 20000)))
+    sample = height[::step, ::step].astype(np.float64)
+    y, x = (axis * step for axis in np.indices(sample.shape))
+    known = np.isfinite(sample)
+    if known.sum() < 3:
+        return height
+    design: NDArray = np.stack([x[known], y[known], np.ones(known.sum())], axis=-1)
+    values = sample[known]
+    weight: NDArray = np.ones(len(values))
+    coefficients: NDArray = np.zeros(3)
+    for _ in range(rounds):
+        coefficients = np.linalg.lstsq(
+            design * weight[:, None], values * weight, rcond=None)[0]
+        residual = np.abs(values - design @ coefficients)
+        scale = 1.4826 * np.median(residual) + 1e-12
+        weight = np.sqrt(1 / (1 + (residual / (2 * scale)) ** 2))
+    rows, columns = height.shape
+    plane = (coefficients[0] * np.arange(columns)[None, :]
+             + coefficients[1] * np.arange(rows)[:, None] + coefficients[2])
+    return height - plane.astype(np.float32)
+
+
+def _metric(w: NDArray, normal: NDArray, rays: Rays,
+            plane_normal: tuple[float, float, float], plane_offset: float) -> NDArray[np.float32]:
+    """Turn w (or z, parallel projection) into height above the plane with median zero."""
+    height = np.empty(w.shape, np.float32)
+    nx, ny, nz = plane_normal
+    nodes = rays.nodes
+    if np.isfinite(rays.standoff):
+        # distance of a point at depth s along its ray: base - s * slope, zero at base / slope
+        base = nz * rays.standoff - plane_offset
+        slope = nz - nx * nodes[..., 0] - ny * nodes[..., 1]
+    else:
+        base = 0.0
+        slope = nx * nodes[..., 0] + ny * nodes[..., 1]
+
+    def fill(constant: float, values: NDArray, lattice: int, out: NDArray) -> None:
+        def work(first: int, last: int) -> None:
+            _height_rows(w, normal, slope, rays.step, first, last, lattice, base, constant, nz,
+                         not np.isfinite(rays.standoff), out)
+        for_bands(len(values), BAND, work)
+
+    lattice = max(1, int(np.sqrt(w.size / 50000)))
+    sample = np.full((-(-w.shape[0] // lattice), -(-w.shape[1] // lattice)), np.nan, np.float32)
+    fill(np.nan, sample, lattice, sample)
+    constant = float(np.nanmedian(sample)) if np.isfinite(sample).any() else 0.0
+    fill(constant, height, 1, height)
+    return height
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def _gradient_rows(normal, nodes, step, first, parallel, du, dv):    # type: ignore[no-untyped-def]
+    rows, width = du.shape
+    nan, unit = np.float32(np.nan), np.float32(1) / np.float32(step)
+    least = np.float32(1e-3)
+    for y in range(rows):
+        i = (first + y) // step
+        fy = np.float32((first + y) - i * step) * unit
+        for j in range((width - 1) // step + 1):
+            # bilinear cell: value and both derivatives of the ray
+            x00, x01 = nodes[i, j, 0], nodes[i, j + 1, 0]
+            x10, x11 = nodes[i + 1, j, 0], nodes[i + 1, j + 1, 0]
+            y00, y01 = nodes[i, j, 1], nodes[i, j + 1, 1]
+            y10, y11 = nodes[i + 1, j, 1], nodes[i + 1, j + 1, 1]
+            left_x, right_x = x00 + fy * (x10 - x00), x01 + fy * (x11 - x01)
+            left_y, right_y = y00 + fy * (y10 - y00), y01 + fy * (y11 - y01)
+            xu, yu = (right_x - left_x) * unit, (right_y - left_y) * unit
+            for x in range(j * step, min((j + 1) * step, width)):
+                k = np.float32(x - j * step)
+                f = k * unit
+                xv = ((x10 - x00) + f * ((x11 - x01) - (x10 - x00))) * unit
+                yv = ((y10 - y00) + f * ((y11 - y01) - (y10 - y00))) * unit
+                nx, ny, nz = normal[y, x, 0], normal[y, x, 1], normal[y, x, 2]
+                if parallel:
+                    # dz = p dX + q dY with p = -n_x / n_z
+                    facing = -nz
+                    good = nz > least
+                else:
+                    facing = nz - nx * (left_x + k * xu) - ny * (left_y + k * yu)
+                    good = facing > least
+                scale = np.float32(1) / facing if good else nan
+                du[y, x] = (nx * xu + ny * yu) * scale
+                dv[y, x] = (nx * xv + ny * yv) * scale
+
+
+@numba.njit(nogil=True, cache=True, error_model='numpy')
+def _divergence_rows(du, dv, first, last, out):    # type: ignore[no-untyped-def]
+    height, width = du.shape
+    half, zero = np.float32(0.5), np.float32(0)
+    for y in range(first, last):
+        up, down = max(y - 1, 0), min(y + 1, height - 1)
+        # mirrored border: mean gradient of the missing link is zero
+        above = np.float32(-1) if y > 0 else np.float32(1)
+        below = np.float32(1) if y < height - 1 else np.float32(-1)
+        for x in range(width):
+            a = dv[up, x]
+            b = dv[down, x]
+            value = (zero if np.isnan(b) else b) * below + (zero if np.isnan(a) else a) * above
+            left, right = max(x - 1, 0), min(x + 1, width - 1)
+            a = du[y, left]
+            b = du[y, right]
+            a = zero if np.isnan(a) else a
+            b = zero if np.isnan(b) else b
+            value += (b if x < width - 1 else -b) - (a if x > 0 else -a)
+            out[y, x] = value * half
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def _divide_rows(spectrum, column, row):    # type: ignore[no-untyped-def]
+    rows, width = spectrum.shape
+    for y in range(rows):
+        for x in range(width):
+            eigenvalue = column[y] + row[x]
+            spectrum[y, x] = (spectrum[y, x] / eigenvalue if eigenvalue < 0
+                              else np.float32(0))    # the mean is free: zero
+
+
+@numba.njit(nogil=True, cache=True, error_model='numpy')
+def _height_rows(w, normal, slope, step, first, last, lattice,    # type: ignore[no-untyped-def]
+                 base, constant, plane_z, parallel, out):
+    """Heights on every ``lattice``-th pixel; a NaN ``constant`` asks what it would have to be."""
+    for row in range(first, last):
+        y = row * lattice
+        i = y // step
+        fy = (y - i * step) / step
+        for column in range(out.shape[1]):
+            x = column * lattice
+            if np.isnan(normal[y, x, 2]):
+                out[row, column] = np.nan
+                continue
+            j = x // step
+            fx = (x - j * step) / step
+            top = slope[i, j] + fx * (slope[i, j + 1] - slope[i, j])
+            bottom = slope[i + 1, j] + fx * (slope[i + 1, j + 1] - slope[i + 1, j])
+            s = top + fy * (bottom - top)
+            value = np.float64(w[y, x])
+            if parallel:
+                distance = value * plane_z + s
+                out[row, column] = distance if np.isnan(constant) else distance - constant
+            elif np.isnan(constant):
+                # ln of the depth at which this pixel would lie on the plane, less its w
+                out[row, column] = np.log(base / s) - value
+            else:
+                out[row, column] = base - np.exp(value + constant) * s

@@ -1,0 +1,230 @@
+"""One stack in, all asked-for surface quantities out. Pure and deterministic, no ROS."""
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ps_head_driver.errors import ErrorCode, PsError
+from ps_head_driver.stack import Stack
+from ps_reconstruction import integration, least_squares, preview, surface
+from ps_reconstruction.near_field import (
+    check,
+    photometric_problem,
+    stack_rays,
+    surface_heights,
+)
+from ps_reconstruction.problem import Problem, Solution
+from ps_reconstruction.surface import Roughness
+from ps_reconstruction.weighted_integration import integrate
+
+METHODS = ('ls', 'stv')
+OUTPUTS = ('normal', 'slope', 'albedo', 'height', 'curvature', 'shape', 'confidence', 'preview',
+           'roughness')
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to reconstruct; the defaults suit quasi-planar machined parts.
+
+    :param method: 'ls' or 'stv'.
+    :param near_field: light vectors per pixel from the panel geometry.
+    :param height_rounds: alternations of height and lighting, 0 for none.
+    :param careful: integrate with confidence weights and masks instead of by cosine transform.
+    :param flatten_height: subtract the plane that fits the surface best from the height.
+    :param saturation: share of full scale that counts as saturated.
+    :param smoothness: sigma of the smoothing of shape and curvature, px.
+    :param flattening: sigma above which slow form is removed from the shape, px; 0 takes a 30th of
+        the longer side.
+    :param contrast: of the shape, 1 is normal.
+    :param s_filter: roughness S-filter nesting index, m; 0 for none.
+    :param l_filter: roughness L-filter nesting index, m.
+    :param pixel_pitch: m, for stacks without a camera; 0: unknown.
+    """
+
+    method: str = 'ls'
+    near_field: bool = True
+    height_rounds: int = 2
+    careful: bool = False
+    flatten_height: bool = False
+    saturation: float = 0.98
+    smoothness: float = 1.0
+    flattening: float = 0.0
+    contrast: float = 1.0
+    s_filter: float = 0.0
+    l_filter: float = 0.8e-3
+    pixel_pitch: float = 0.0
+
+    def __post_init__(self) -> None:
+        def refuse(name: str, what: str) -> None:
+            raise PsError(ErrorCode.RECONSTRUCTION_BAD_PARAMETER,
+                          f'{name}: {getattr(self, name)!r} {what}')
+        if self.method not in METHODS:
+            refuse('method', f'is not one of {", ".join(METHODS)}')
+        for name in ('smoothness', 'flattening', 's_filter', 'pixel_pitch', 'height_rounds'):
+            if not 0 <= getattr(self, name) < float('inf'):
+                refuse(name, 'must not be negative')
+        for name in ('contrast', 'l_filter', 'saturation'):
+            if not 0 < getattr(self, name) < float('inf'):
+                refuse(name, 'must be positive')
+
+
+@dataclass
+class Reconstruction:
+    """What was asked for of one stack; the rest is None.
+
+    Shapes and units: normal (H, W, 3) n_plane; slope (H, W, 2); albedo (H, W) or (H, W, 3)
+    relative; height (H, W) m above the reference plane, median 0; curvature (H, W) 1/m; all
+    float32, NaN where invalid. shape, confidence (H, W) uint8; preview (H, W, 3) uint8 RGB; reason
+    (H, W) uint8, bits of problem.py.
+
+    :param metric: lengths are metres; False if the scale is unknown (then pixels).
+    """
+
+    method: str
+    near_field: bool
+    metric: bool
+    normal: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    pixel_pitch: float
+    slope: NDArray[np.float32] | None = None
+    albedo: NDArray[np.float32] | None = None
+    height: NDArray[np.float32] | None = None
+    curvature: NDArray[np.float32] | None = None
+    shape: NDArray[np.uint8] | None = None
+    confidence: NDArray[np.uint8] | None = None
+    reason: NDArray[np.uint8] | None = None
+    preview: NDArray[np.uint8] | None = None
+    roughness: Roughness = field(default_factory=Roughness)
+    timings: dict[str, float] = field(default_factory=dict)
+    valid_fraction: float = 0.0
+    residual_rms: float = float('nan')
+
+
+def reconstruct(stack: Stack, options: Options | None = None,
+                outputs: set[str] | None = None) -> Reconstruction:
+    """Reconstruct a stack.
+
+    :param outputs: names of OUTPUTS; None for all. Only these and what they need are computed.
+    :raises PsError: RECONSTRUCTION_* naming what is wrong with the stack or an option.
+    """
+    options = options or Options()
+    wanted = set(OUTPUTS) if outputs is None else set(outputs)
+    if wanted - set(OUTPUTS):
+        raise PsError(ErrorCode.RECONSTRUCTION_BAD_PARAMETER,
+                      f'outputs: {", ".join(sorted(wanted - set(OUTPUTS)))}: not among '
+                      + ', '.join(OUTPUTS))
+    timings: dict[str, float] = {}
+    with _timed(timings, 'lights'):
+        stack = check(stack)
+        near = options.near_field and any(not light.distant for light in stack.lights)
+        if near and stack.camera is None:
+            raise PsError(ErrorCode.RECONSTRUCTION_BAD_STACK,
+                          'camera_info: near lights need camera intrinsics (focal length is 0); '
+                          'set near_field to false to do without')
+        heights = None
+        if near:
+            least_squares.check_lights(photometric_problem(stack).lights)
+            heights, _ = surface_heights(stack, options.height_rounds)
+        problem = photometric_problem(stack, near, options.saturation, heights)
+    with _timed(timings, 'normals'):
+        careful = options.careful and 'height' in wanted
+        solution = _solve(problem, options, 'confidence' in wanted or careful)
+        valid = np.isfinite(solution.normal[..., 2])
+    rays = stack_rays(stack, options.pixel_pitch)
+    pitch = _pitch(stack, options)
+    result = Reconstruction(
+        options.method, near, stack.camera is not None or options.pixel_pitch > 0,
+        solution.normal, valid, pitch, reason=solution.reason,
+        residual_rms=solution.residual_rms, timings=timings)
+    # pixels that the mask leaves out are no failures
+    used = valid.size if stack.mask is None else np.count_nonzero(stack.mask)
+    result.valid_fraction = np.count_nonzero(valid) / used
+    if 'albedo' in wanted:
+        result.albedo = solution.albedo
+    if 'confidence' in wanted:
+        result.confidence = solution.confidence
+    if 'slope' in wanted:
+        with _timed(timings, 'slope'):
+            result.slope = surface.slope(solution.normal)
+    if wanted & {'height', 'shape', 'roughness'}:
+        _integrate(result, stack, rays, options, wanted, solution)
+    if 'curvature' in wanted:
+        with _timed(timings, 'curvature'):
+            result.curvature = surface.mean_curvature(
+                solution.normal, pitch, options.smoothness)
+    if 'preview' in wanted:
+        with _timed(timings, 'preview'):
+            result.preview = preview.normal_picture(solution.normal)
+    return result
+
+
+def warm_up() -> None:
+    """Compile all kernels on a small stack, so that the first real one is not late."""
+    from ps_head_driver.head_model import CameraGeometry
+    from ps_head_driver.stack import Light, Panel
+    camera = CameraGeometry(width_px=48, height_px=40, fx=300, fy=300, cx=23.5, cy=19.5,
+                            camera_standoff=0.3)
+    lights = [Light(panel=Panel(i), position=(0.1 * c, 0.1 * s, 0.12), size=(0.06, 0.03),
+                    axis=(-0.64 * c, -0.64 * s, -0.768375), right=(-s, c, 0.0))
+              for i, (c, s) in enumerate([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])]
+    for dtype in (np.uint8, np.uint16):
+        images = [np.full((40, 48), 100, dtype) for _ in lights]
+        reconstruct(Stack(images, lights, camera))
+
+
+@contextmanager
+def _timed(timings: dict[str, float], stage: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    timings[stage] = time.perf_counter() - start
+
+
+def _solve(problem: Problem, options: Options, quality: bool) -> Solution:
+    if options.method == 'stv':
+        from ps_reconstruction import stv
+        return stv.solve(problem, quality=quality)
+    return least_squares.solve(problem, quality=quality)
+
+
+def _pitch(stack: Stack, options: Options) -> float:
+    """Pixel distance on the reference plane at the optical axis, m (1 if unknown)."""
+    if stack.camera is None:
+        return options.pixel_pitch or 1.0
+    depth = stack.camera.camera_standoff - stack.plane.offset / stack.plane.normal[2]
+    return depth / stack.camera.fx
+
+
+def _integrate(result: Reconstruction, stack: Stack, rays: integration.Rays, options: Options,
+               wanted: set[str], solution: Solution) -> None:
+    timings = result.timings
+    plane = stack.plane
+    if 'height' in wanted:
+        with _timed(timings, 'height'):
+            solver = None
+            if options.careful:
+                pitch = 1 / stack.camera.fx if stack.camera is not None else result.pixel_pitch
+                solver = partial(integrate, confidence=solution.confidence, pitch=pitch)
+            result.height = integration.height_from_normals(
+                result.normal, rays, plane.normal, plane.offset, solver)
+            if options.flatten_height:
+                result.height = integration.remove_plane(result.height)
+    if wanted & {'shape', 'roughness'}:
+        du, dv = integration.gradients(result.normal, rays)
+        # the perspective integral is ln(depth): higher is less
+        parallel = stack.camera is None
+        metres = 1.0 if stack.camera is None else -result.pixel_pitch * stack.camera.fx
+    if 'shape' in wanted:
+        with _timed(timings, 'shape'):
+            relief = surface.band_passed(
+                du, dv, options.smoothness, options.flattening or max(stack.shape) / 30)
+            result.shape = surface.shape_image(
+                relief, result.mask, options.contrast * (1 if parallel else -1))
+    if 'roughness' in wanted and result.metric:
+        with _timed(timings, 'roughness'):
+            result.roughness = surface.roughness(
+                result.normal, du, dv, result.pixel_pitch, metres, options.s_filter,
+                options.l_filter)

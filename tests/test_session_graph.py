@@ -1,8 +1,12 @@
 """The session recorder as a process: real messages over DDS, recorded, killed, read back."""
 from collections.abc import Callable, Iterator
+import csv
+import json
 import os
 from pathlib import Path
 import signal
+import subprocess
+import sys
 import time
 from typing import Any
 
@@ -15,6 +19,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.serialization import serialize_message
 from std_msgs.msg import String
 
 from ps_head_driver.conversions import message_to_stack, stack_to_message
@@ -208,3 +213,89 @@ def test_terminated_recorder_closes_its_session(peer: Peer) -> None:
     process.send_signal(signal.SIGTERM)
     assert process.wait(10) == 0
     assert Session(peer.folder / 'ended').info().complete
+
+
+def run_session_command(*words: object) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, '-m', 'ps_inspection.cli.ps_session', *map(str, words)],
+                          capture_output=True, text=True, timeout=60, check=False)
+
+
+def record_three(peer: Peer, name: str) -> Path:
+    peer.calibration.publish(HeadCalibration(calibration_id='played'))
+    time.sleep(0.3)
+    assert peer.start(name).success
+    for stack_id in 'abc':
+        peer.stack.publish(stack_to_message(make_stack(stack_id)))
+        peer.until(lambda stack_id=stack_id: stack_id in peer.recorded)
+        time.sleep(0.2)
+    assert peer.stop().success
+    return peer.folder / name
+
+
+def test_session_is_played_into_the_graph(peer: Peer) -> None:
+    folder = record_three(peer, 'source')
+    stacks: list[PhotometricStack] = []
+    calibrations: list[str] = []
+    peer.node.create_subscription(PhotometricStack, '/other/stack', stacks.append, RELIABLE)
+    peer.node.create_subscription(
+        HeadCalibration, '/other/calibration', lambda m: calibrations.append(m.calibration_id),
+        LATCHED)
+    # from the second stack on; the calibration before it comes all the same
+    command = subprocess.Popen(
+        [sys.executable, '-m', 'ps_inspection.cli.ps_session', 'play', str(folder),
+         '--namespace', 'other', '--start', '0.15', '--rate', '2'], stdout=subprocess.PIPE)
+    try:
+        peer.until(lambda: command.poll() is not None, 30)
+    finally:
+        command.kill()
+        command.communicate()
+    assert command.returncode == 0
+    peer.until(lambda: len(stacks) == 2 and calibrations)
+    assert [stack.stack_id for stack in stacks] == ['b', 'c']
+    assert calibrations == ['played']
+    # to the bit; NaN fields would not compare equal as messages
+    original = [serialize_message(stack) for stack in Session(folder).stacks()]
+    assert [serialize_message(stack) for stack in stacks] == original[1:]
+
+
+def test_info_and_recover_commands(peer: Peer, tmp_path: Path) -> None:
+    folder = record_three(peer, 'cut')
+    file = folder / 'cut_0.mcap'
+    file.write_bytes(file.read_bytes()[:-2000])
+    (folder / 'metadata.yaml').unlink()
+    report = tmp_path / 'report.json'
+
+    done = run_session_command('info', folder, '--json', report)
+    assert done.returncode == 0, done.stderr
+    assert 'unfinished' in done.stdout
+    content = json.loads(report.read_text())
+    assert content['stacks'] == 3
+    assert content['metadata']['session']['session_id'] == 'cut'
+    done = run_session_command('recover', folder)
+    assert done.returncode == 0, done.stderr
+    assert Session(folder).info().complete
+    assert 'nothing to do' in run_session_command('recover', folder).stdout
+
+
+def test_export_keeps_every_stack(peer: Peer, tmp_path: Path) -> None:
+    from ps_head_driver.stack_folder import read_stack
+    folder = record_three(peer, 'parts')
+    done = run_session_command('export', folder, '--out', tmp_path / 'out')
+    assert done.returncode == 0, done.stderr
+    with (tmp_path / 'out' / 'index.csv').open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [row['stack_id'] for row in rows] == ['a', 'b', 'c']
+    for row in rows:
+        stack, _ = read_stack(tmp_path / 'out' / row['folder'])
+        np.testing.assert_array_equal(stack.images, make_stack(row['stack_id']).images)
+    again = run_session_command('export', folder, '--out', tmp_path / 'out')
+    assert '3 were there' in ' '.join(again.stdout.split())
+
+
+@pytest.mark.parametrize('command', ['info', 'recover', 'play'])
+def test_commands_say_in_one_line_what_is_wrong(tmp_path: Path, command: str) -> None:
+    done = run_session_command(command, tmp_path / 'missing')
+    assert done.returncode == 1
+    assert done.stderr.strip().count('\n') == 0
+    assert 'does not exist' in done.stderr
+    assert run_session_command(command).returncode == 2

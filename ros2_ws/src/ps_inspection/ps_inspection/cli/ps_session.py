@@ -1,0 +1,177 @@
+"""ps_session: look into, play, export, reconstruct and repair recorded sessions."""
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from datetime import datetime
+import json
+from pathlib import Path
+import select
+import sys
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from ps_head_driver.errors import PsError
+from ps_inspection.session_format import STACK_TYPE
+from ps_inspection.session_reader import Session
+
+Report = dict[str, Any]
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='ps_session', formatter_class=argparse.RawDescriptionHelpFormatter,
+        description='Look into, play, export, reconstruct and repair recorded sessions.',
+        epilog='example: ps_session info ~/ps_sessions/session_20260102_030405')
+    commands = parser.add_subparsers(dest='command', required=True)
+
+    def add(name: str, run: Callable[[argparse.Namespace, Console], Report], text: str,
+            example: str) -> argparse.ArgumentParser:
+        command = commands.add_parser(
+            name, help=text, description=text, epilog=f'example: ps_session {name} {example}')
+        command.add_argument('session', type=Path, metavar='SESSION',
+                             help='session folder (or the .mcap file in it)')
+        command.add_argument('--json', type=Path, metavar='FILE', help='write the result as JSON')
+        command.set_defaults(run=run)
+        return command
+
+    add('info', _info, 'Say what is in a session, also in an unfinished one.', 'SESSION')
+    add('recover', _recover, 'Make a session complete that a crash cut off.', 'SESSION')
+    play = add('play', _play, 'Play a session into a running graph; Enter pauses.',
+               'SESSION --rate 2')
+    play.add_argument('--rate', type=_positive, default=1.0, help='2: twice as fast')
+    play.add_argument('--start', type=float, default=0.0, metavar='S',
+                      help='seconds to leave out at the beginning')
+    play.add_argument('--loop', action='store_true', help='begin again at the end')
+    play.add_argument('--all', action='store_true',
+                      help='also reconstruction_info and diagnostics, which live nodes send')
+    play.add_argument('--namespace', default='', help='in place of the recorded one')
+    export = add('export', _export, 'Write stack folders and an index.csv.', 'SESSION --out DIR')
+    export.add_argument('--out', type=Path, required=True, metavar='DIR')
+    again = add('reconstruct', _reconstruct,
+                'Reconstruct every stack; run again to go on after an interruption.',
+                'SESSION --out DIR')
+    again.add_argument('--out', type=Path, required=True, metavar='DIR')
+    again.add_argument('--method', choices=('ls', 'stv'), default='ls')
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    options = _parser().parse_args(argv)
+    console = Console(highlight=False)
+    try:
+        report = options.run(options, console)
+        if options.json:
+            options.json.write_text(json.dumps(report, indent=2) + '\n')
+    except PsError as error:
+        sys.exit(f'ps_session: {error.message}')
+    except OSError as error:
+        sys.exit(f'ps_session: {error.filename}: {error.strerror}')
+    except KeyboardInterrupt:
+        sys.exit(130)
+    if report.get('failed'):
+        sys.exit(f'ps_session: {len(report["failed"])} stacks failed')
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float('inf'):
+        raise argparse.ArgumentTypeError('must be positive')
+    return value
+
+
+def _info(options: argparse.Namespace, console: Console) -> Report:
+    info = Session(options.session).info()
+    table = Table('topic', 'type', 'messages', box=None, pad_edge=False)
+    for name, count in info.counts.items():
+        table.add_row(name, info.types[name], str(count))
+    about = info.scan.metadata.get('session', {})
+    for name, value in about.items():
+        console.print(f'{name:12} {value}', markup=False)
+    start = datetime.fromtimestamp(info.start * 1e-9).astimezone()
+    console.print(f'start        {start.isoformat(timespec="milliseconds")}')
+    console.print(f'duration     {(info.end - info.start) * 1e-9:.3f} s')
+    console.print(f'size         {info.size_bytes / 1e6:.1f} MB, {info.scan.compression}')
+    console.print(table)
+    for problem in info.scan.problems:
+        console.print(f'damage: {problem}', style='yellow', markup=False)
+    if not info.complete:
+        console.print('unfinished: "ps_session recover" makes it complete', style='yellow')
+    return {
+        'file': str(info.path), 'complete': info.complete, 'size_bytes': info.size_bytes,
+        'start_ns': info.start, 'end_ns': info.end, 'messages': info.counts,
+        'stacks': sum(n for t, n in info.counts.items() if info.types[t] == STACK_TYPE),
+        'metadata': info.scan.metadata, 'problems': info.scan.problems}
+
+
+def _recover(options: argparse.Namespace, console: Console) -> Report:
+    result = Session(options.session).recover()
+    for problem in result.problems:
+        console.print(f'damage: {problem}', style='yellow', markup=False)
+    console.print(f'{"recovered" if result.changed else "nothing to do"}: {result.messages} '
+                  f'messages, {result.stacks} stacks, {result.lost_bytes} bytes given up')
+    return asdict(result)
+
+
+def _play(options: argparse.Namespace, console: Console) -> Report:
+    # rclpy takes a second to import, which info and recover need not wait for
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
+    from ps_inspection.session_player import Player, PlayOptions
+
+    paused = False
+
+    def is_paused() -> bool:
+        nonlocal paused
+        if sys.stdin.isatty() and select.select([sys.stdin], [], [], 0)[0]:
+            sys.stdin.readline()
+            paused = not paused
+            console.print('paused, Enter goes on' if paused else 'playing')
+        return paused
+
+    session = Session(options.session)
+    # Ctrl-C must end the sleep between two messages, not only the context
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        node = rclpy.create_node('ps_session_player')
+        sent = Player(
+            node, session,
+            PlayOptions(options.rate, options.start, options.loop, options.all,
+                        options.namespace),
+            is_paused,
+            lambda message: console.print(f'{message.log_time * 1e-9:.3f} {message.topic.name}'),
+        ).play()
+        node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+    console.print(f'{sent} messages played')
+    return {'messages': sent}
+
+
+def _export(options: argparse.Namespace, console: Console) -> Report:
+    from ps_inspection.session_export import export_session
+    return _said(asdict(export_session(Session(options.session), options.out, console.print)),
+                 options.out, console)
+
+
+def _reconstruct(options: argparse.Namespace, console: Console) -> Report:
+    from ps_inspection.session_export import reconstruct_session
+    from ps_reconstruction.pipeline import Options
+    outcome = reconstruct_session(Session(options.session), options.out,
+                                  Options(method=options.method), console.print)
+    return _said(asdict(outcome), options.out, console)
+
+
+def _said(report: Report, out: Path, console: Console) -> Report:
+    for problem in report['problems']:
+        console.print(f'damage: {problem}', style='yellow', markup=False)
+    console.print(f'{out}: {report["done"]} stacks written, {report["skipped"]} were there, '
+                  f'{len(report["failed"])} failed')
+    return report
+
+
+if __name__ == '__main__':
+    main()

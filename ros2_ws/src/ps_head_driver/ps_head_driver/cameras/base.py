@@ -17,11 +17,11 @@ Light = tuple[Mode, Panel]
 class Frame:
     """One triggered picture and what the camera says about it.
 
-    :param image: (H, W) or (H, W, 3), uint8 or uint16, linear, RGB order; nobody else writes to it.
+    :param image: (H, W) or (H, W, 3), uint8 or uint16, linear, RGB order; nobody writes to it.
     :param frame_counter: the camera's own count, one more for each frame that it exposed.
     :param trigger_counter: count of triggers since the board's power-up; None if not reported.
     :param device_time_ns: start of exposure on the camera's clock; None if not reported.
-    :param host_time_ns: start of exposure on this host's clock (Unix time), as well as it is known.
+    :param host_time_ns: start of exposure on this host's clock (Unix time), as far as known.
     :param exposure_time: s.
     :param gain: dB.
     """

@@ -1,0 +1,238 @@
+"""The fake camera's pictures: what a head with its true geometry makes of a scene.
+
+For each pixel the ray through the lens meets the surface; for each panel the radiance of that
+point is summed over emitters on the panel, with attached and cast shadows (shading.py). Radiance
+is linear in the panels' levels and kept, so that a repeated frame costs only scaling and noise.
+"""
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ps_head_driver.camera_model import scaled_camera
+from ps_head_driver.fake import shading
+from ps_head_driver.fake.scenes import Scene
+from ps_head_driver.frames import slope_to_normal
+from ps_head_driver.head_model import DIRECTIONS, CameraGeometry, HeadModel
+from ps_head_driver.kinematics import BrightFieldKinematics, DarkFieldKinematics, PanelPose
+from ps_head_driver.stack import Truth
+
+#: Emitters along a panel's width and height where it is fully visible, and where it is partly so.
+COARSE = (6, 3)
+FINE = (12, 6)
+
+OFF = (0.0, 0.0, 0.0, 0.0)
+
+# Radiance at the centre of a matt plate of albedo 0.8 under one panel of the nominal head at a tilt
+# of 30 degrees, in units of the panel's radiance: it fixes the camera's sensitivity.
+_REFERENCE_RADIANCE = 0.014105
+_REFERENCE_LEVEL = 0.7
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """The camera behind the lens.
+
+    With the defaults a matt plate of albedo 0.8 under one panel at 30 degrees tilt fills 70 % of
+    the range at the picture's centre.
+
+    :param bit_depth: 8 or 16.
+    :param noise: shot and read noise; quantisation and saturation are always there.
+    :param full_well: electrons at full scale and 0 dB.
+    :param read_noise: electrons, RMS.
+    :param exposure: exposure time at which the levels above hold, s.
+    :param vignetting: relative loss of light in the corners of the picture.
+    :param ambient: light of the room on a white board at that exposure, relative to full scale.
+    """
+
+    bit_depth: int = 8
+    noise: bool = True
+    full_well: float = 10_000.0
+    read_noise: float = 5.0
+    exposure: float = 0.004
+    vignetting: float = 0.0
+    ambient: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.bit_depth not in (8, 16):
+            raise ValueError(f'bit_depth must be 8 or 16, not {self.bit_depth}')
+
+    @property
+    def maximum(self) -> int:
+        """Largest grey value."""
+        return (1 << self.bit_depth) - 1
+
+    def expose(self, level: NDArray, gain_db: float, random: np.random.Generator) -> NDArray:
+        """Turn light into grey values.
+
+        :param level: (H, W) float32 light, 1 = full scale at 0 dB.
+        :param gain_db: amplification after the light was counted.
+        :returns: (H, W) uint8 or uint16.
+        """
+        gain = 10.0 ** (gain_db / 20.0)
+        grey = level * np.float32(gain * self.maximum)
+        if self.noise:
+            # shot noise as a Gaussian of the same variance: indistinguishable above some 20
+            # electrons, and below that read noise rules
+            sigma = np.sqrt(level * np.float32(1 / self.full_well)
+                            + np.float32((self.read_noise / self.full_well) ** 2))
+            noise = random.standard_normal(level.shape, np.float32)
+            noise *= sigma
+            noise *= np.float32(gain * self.maximum)
+            grey += noise
+        np.rint(grey, out=grey)
+        np.clip(grey, 0, self.maximum, out=grey)
+        return grey.astype(np.uint8 if self.bit_depth == 8 else np.uint16)
+
+
+def emitters(pose: PanelPose, count: tuple[int, int]) -> tuple[NDArray, NDArray]:
+    """Divide a panel into equal parts.
+
+    :param count: parts along width and height.
+    :returns: centres of the parts (E, 3) and the panel's description for shading.shade (6, 3).
+    """
+    (width, height), (across, along) = pose.size, count
+    up = np.cross(pose.axis, pose.right)
+    u = ((np.arange(across) + 0.5) / across - 0.5) * width
+    v = ((np.arange(along) + 0.5) / along - 0.5) * height
+    centres = (pose.center + u[:, None, None] * pose.right + v[None, :, None] * up).reshape(-1, 3)
+    azimuth = math.atan2(pose.center[1], pose.center[0])
+    forward = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+    sideways = np.array([-forward[1], forward[0], 0.0])
+    part = np.array([width / across, height / along, pose.lobe_exponent])
+    return centres, np.stack([pose.axis, pose.right, up, part, sideways, forward])
+
+
+def corners(pose: PanelPose) -> NDArray:
+    """Corners of a panel, (4, 3)."""
+    up = np.cross(pose.axis, pose.right)
+    width, height = pose.size
+    return np.array([pose.center + a * width / 2 * pose.right + b * height / 2 * up
+                     for a in (-1, 1) for b in (-1, 1)])
+
+
+def camera_rays(camera: CameraGeometry) -> tuple[NDArray, NDArray]:
+    """Directions of all pixels in ps_head_plane axes, scaled to z = -1.
+
+    :returns: x and y, each (H * W,) float64.
+    """
+    u, v = np.meshgrid(np.arange(camera.width_px, dtype=float),
+                       np.arange(camera.height_px, dtype=float))
+    if not any(camera.distortion):
+        return ((u - camera.cx) / camera.fx).ravel(), (-(v - camera.cy) / camera.fy).ravel()
+    import cv2
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-12)
+    straight = cv2.undistortPointsIter(
+        np.stack([u, v], axis=-1).reshape(-1, 1, 2), matrix, np.array(camera.distortion, float),
+        np.eye(3), np.eye(3), criteria)[:, 0]
+    return np.ascontiguousarray(straight[:, 0]), np.ascontiguousarray(-straight[:, 1])
+
+
+class Renderer:
+    """Pictures and truth of one scene under one head.
+
+    :param scene: what lies under the head.
+    :param head: the head as it really is.
+    :param sensor: the camera behind the lens.
+    :param scale: picture size relative to the head's camera.
+    :param seed: of the noise; the same seed and frame number give the same picture.
+    :param cache_bytes: radiance of panels kept for frames to come.
+    """
+
+    def __init__(self, scene: Scene, head: HeadModel, sensor: Sensor | None = None,
+                 scale: float = 1.0, seed: int = 1, cache_bytes: int = 400_000_000) -> None:
+        self.scene, self.head, self.sensor = scene, head, sensor or Sensor()
+        self.seed = seed
+        self.camera = scaled_camera(head.camera, round(head.camera.width_px * scale),
+                                    round(head.camera.height_px * scale))
+        self._shape = (self.camera.height_px, self.camera.width_px)
+        self._bright, self._dark = BrightFieldKinematics(head), DarkFieldKinematics(head)
+        self._cache: OrderedDict[tuple, NDArray] = OrderedDict()
+        self._cache_bytes = cache_bytes
+        rays = camera_rays(self.camera)
+        scene.require_covers(rays, self.camera.camera_standoff)
+        with shading.KERNEL_LOCK:
+            self._points = shading.intersect(
+                scene.height, scene.albedo, *scene.origin, scene.pitch, *scene.height_range,
+                *rays, self.camera.camera_standoff)
+        self._shadow_grids = shading.shadow_grids(scene.height)
+        self._vignette = self._vignetting()
+
+    def _vignetting(self) -> NDArray | None:
+        if not self.sensor.vignetting:
+            return None
+        height, width = self._shape
+        y, x = np.ogrid[-1:1:height * 1j, -1:1:width * 1j]
+        return (1 - self.sensor.vignetting * (x * x + y * y) / 2).astype(np.float32)
+
+    def panel_radiance(self, pose: PanelPose) -> NDArray:
+        """Radiance of the scene under one panel at full level, without noise.
+
+        :returns: (H, W) float32 in units of the panel's radiance; not to be written to.
+        """
+        key = (*pose.center, *pose.axis, *pose.right, *pose.size, pose.lobe_exponent,
+               pose.intensity)
+        if key in self._cache:
+            self._cache.move_to_end(key)
+            return self._cache[key]
+        with shading.KERNEL_LOCK:
+            radiance = shading.shade(
+                self._points, self.scene.specular, self.scene.roughness,
+                *emitters(pose, COARSE), *emitters(pose, FINE), corners(pose), pose.intensity,
+                *self._shadow_grids, self.scene.height_range[1], *self.scene.origin,
+                self.scene.pitch, self.camera.camera_standoff).reshape(self._shape)
+        radiance.flags.writeable = False
+        self._cache[key] = radiance
+        while len(self._cache) > 1 and len(self._cache) * radiance.nbytes > self._cache_bytes:
+            self._cache.popitem(last=False)
+        return radiance
+
+    def radiance(self, tilt: float, df_tilt: float, bf_levels: Sequence[float],
+                 df_levels: Sequence[float] = OFF) -> NDArray:
+        """Radiance of the scene under all panels that are on, without noise.
+
+        :param tilt: of the bright-field panels, rad.
+        :param df_tilt: of the dark-field panels, rad.
+        :param bf_levels: relative output of E, N, W, S, 0 to 1.
+        :param df_levels: the same for the dark field.
+        :returns: (H, W) float32 in units of a panel's radiance.
+        """
+        total = np.zeros(self._shape, np.float32)
+        for ring, angle, levels in ((self._bright, tilt, bf_levels),
+                                    (self._dark, df_tilt, df_levels)):
+            for direction, level in zip(DIRECTIONS, levels, strict=True):
+                if level > 0:
+                    total += np.float32(level) * self.panel_radiance(
+                        ring.panel_pose(direction, angle))
+        return total
+
+    def render(self, tilt: float, df_tilt: float, bf_levels: Sequence[float],
+               df_levels: Sequence[float] = OFF, exposure: float | None = None,
+               gain: float = 0.0, frame: int = 0) -> NDArray:
+        """One picture.
+
+        :param exposure: time that the panels were on, s; the sensor's reference if None.
+        :param gain: dB.
+        :param frame: number of the frame; selects its noise.
+        :returns: (H, W) uint8 or uint16.
+        """
+        sensor = self.sensor
+        duration = sensor.exposure if exposure is None else exposure
+        level = self.radiance(tilt, df_tilt, bf_levels, df_levels)
+        level *= np.float32(_REFERENCE_LEVEL / _REFERENCE_RADIANCE)
+        if sensor.ambient:
+            level += np.float32(sensor.ambient) * self._points[5].reshape(self._shape)
+        level *= np.float32(duration / sensor.exposure)
+        if self._vignette is not None:
+            level *= self._vignette
+        return sensor.expose(level, gain, np.random.default_rng([self.seed, frame]))
+
+    def truth(self) -> Truth:
+        """True normals (n_plane) and heights where the pixels really look."""
+        points = self._points.reshape(6, *self._shape)
+        return Truth(normal=slope_to_normal(np.stack([points[3], points[4]], axis=-1)),
+                     height=points[2].copy())

@@ -37,6 +37,8 @@ _ps_enter() {
   else
     . "$_ps_root/ros2_ws/install/local_setup.sh"
   fi
+  # ament leaves an empty last entry, which would mean the present folder
+  if [ -n "${LD_LIBRARY_PATH:-}" ]; then export LD_LIBRARY_PATH="${LD_LIBRARY_PATH%:}"; fi
   for _ps_package in ps_head_driver ps_reconstruction ps_calibration ps_inspection; do
     _ps_front PATH "$_ps_root/ros2_ws/install/$_ps_package/lib/$_ps_package"
   done

@@ -12,17 +12,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_head_driver.head_model import (
-    DIRECTIONS, BrightField, DarkField, Direction, HeadModel, PanelTolerance)
+from ps_head_driver.head_model import DIRECTIONS, BrightField, DarkField, Direction, HeadModel
 from ps_head_driver.stack import Light, Mode, Panel
 
 # closer to a dead point than this (rad of crank angle) the tilt is not defined by the motor
 DEAD_POINT_MARGIN = 1e-3
+_VERTICAL = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
 class PanelPose:
-    """Where one panel is: centre (3,), unit axis out of its face (3,), unit width direction (3,)."""
+    """Where one panel is: centre, unit axis out of its face, unit width direction; each (3,)."""
 
     center: NDArray
     axis: NDArray
@@ -30,6 +30,57 @@ class PanelPose:
     size: tuple[float, float]      # width, height, m
     lobe_exponent: float
     intensity: float
+
+
+class PanelRing:
+    """The four panels of a ring, E N W S, as functions of their common tilt.
+
+    The tolerances of a panel come on top of the nominal geometry: ``tilt_offset`` adds to the
+    tilt, ``twist`` turns it about the vertical through the hinge, ``shift`` moves it along its
+    radial, tangential and z axes.
+    """
+
+    def __init__(self, field: BrightField | DarkField) -> None:
+        own = [field.panels[name] for name in DIRECTIONS]  # type: ignore[index]
+        self.size, self.lobe_exponent = field.panel_size, field.lobe_exponent
+        self.intensities = [panel.intensity for panel in own]
+        self._tilt_offset = np.array([panel.tilt_offset for panel in own])
+        azimuth = np.array([panel.azimuth for panel in own])
+        twisted = azimuth + [panel.twist for panel in own]
+        self.radial, tangential = _turned(azimuth)
+        self._outward, self.right = _turned(twisted)
+        hinge = field.hinge if isinstance(field, BrightField) else field.pivot
+        shift = np.array([panel.shift for panel in own])
+        self._base = ((hinge.r + shift[:, :1]) * self.radial + shift[:, 1:2] * tangential
+                      + (hinge.z + shift[:, 2:]) * _VERTICAL)
+        self._along, self._out = ((field.arm.along, field.arm.out)
+                                  if isinstance(field, BrightField) else (0.0, 0.0))
+
+    def axes(self, tilt: ArrayLike) -> tuple[NDArray, NDArray]:
+        """Centres and unit axes at nominal tilts.
+
+        :param tilt: (...), rad; axis = -sin(tilt) radial - cos(tilt) z.
+        :returns: (..., 4, 3) and (..., 4, 3).
+        """
+        angle = (np.asarray(tilt, np.float64)[..., None] + self._tilt_offset)[..., None]
+        sine, cosine = np.sin(angle), np.cos(angle)
+        axis = -sine * self._outward - cosine * _VERTICAL
+        arm = self._along * (cosine * self._outward - sine * _VERTICAL) + self._out * axis
+        return self._base + arm, axis
+
+    def pose(self, direction: Direction, tilt: float) -> PanelPose:
+        """Pose of one panel at a nominal tilt, rad."""
+        index = DIRECTIONS.index(direction)
+        center, axis = self.axes(tilt)
+        return PanelPose(center=center[index], axis=axis[index], right=self.right[index],
+                         size=self.size, lobe_exponent=self.lobe_exponent,
+                         intensity=self.intensities[index])
+
+
+def _turned(azimuth: NDArray) -> tuple[NDArray, NDArray]:
+    """Radial and tangential unit vectors (n, 3) at azimuths (n,)."""
+    c, s, zero = np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)
+    return np.stack([c, s, zero], axis=1), np.stack([-s, c, zero], axis=1)
 
 
 class BrightFieldKinematics:
@@ -42,7 +93,8 @@ class BrightFieldKinematics:
     """
 
     def __init__(self, head: HeadModel) -> None:
-        self._field = field = head.bright_field
+        field = head.bright_field
+        self.ring = PanelRing(field)
         self._hinge = np.array([field.hinge.r, field.hinge.z])
         self._radius, self._offset = field.crank.radius, field.crank.offset
         self._rod, self._slider = field.rod_length, field.slider
@@ -164,48 +216,19 @@ class BrightFieldKinematics:
 
     def panel_pose(self, direction: Direction, tilt: float) -> PanelPose:
         """Pose of one panel at a nominal tilt (rad), its own tolerances included."""
-        return panel_pose(self._field, direction, tilt)
+        return self.ring.pose(direction, tilt)
 
 
 class DarkFieldKinematics:
     """The dark-field panels, turned about their pivots by a servo."""
 
     def __init__(self, head: HeadModel) -> None:
-        self._field = head.dark_field
+        self.ring = PanelRing(head.dark_field)
         self.tilt_limits = head.dark_field.tilt_range
 
     def panel_pose(self, direction: Direction, tilt: float) -> PanelPose:
         """Pose of one panel at a nominal tilt (rad), its own tolerances included."""
-        return panel_pose(self._field, direction, tilt)
-
-
-def panel_pose(field: BrightField | DarkField, direction: Direction, tilt: float) -> PanelPose:
-    """Pose of one panel of a ring at a nominal tilt.
-
-    Its own tolerances come on top: ``tilt_offset`` adds to the tilt, ``twist`` turns it about the
-    vertical through the hinge, ``shift`` moves it along its radial, tangential and z axes.
-
-    :param tilt: rad; axis = -sin(tilt) radial - cos(tilt) z.
-    """
-    own: PanelTolerance = field.panels[direction]
-    radial = np.array([math.cos(own.azimuth), math.sin(own.azimuth), 0.0])
-    tangential = np.array([-math.sin(own.azimuth), math.cos(own.azimuth), 0.0])
-    vertical = np.array([0.0, 0.0, 1.0])
-    angle = tilt + own.tilt_offset
-    axis = -math.sin(angle) * radial - math.cos(angle) * vertical
-    along = math.cos(angle) * radial - math.sin(angle) * vertical
-    if isinstance(field, BrightField):
-        hinge = field.hinge.r * radial + field.hinge.z * vertical
-        arm = field.arm.along * along + field.arm.out * axis
-    else:
-        hinge = field.pivot.r * radial + field.pivot.z * vertical
-        arm = np.zeros(3)
-    c, s = math.cos(own.twist), math.sin(own.twist)
-    twist = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    shift = own.shift[0] * radial + own.shift[1] * tangential + own.shift[2] * vertical
-    return PanelPose(
-        center=hinge + twist @ arm + shift, axis=twist @ axis, right=twist @ tangential,
-        size=field.panel_size, lobe_exponent=field.lobe_exponent, intensity=own.intensity)
+        return self.ring.pose(direction, tilt)
 
 
 def lights_at(head: HeadModel, m_counts: int, dark_field_tilt: float) -> list[Light]:
@@ -215,13 +238,13 @@ def lights_at(head: HeadModel, m_counts: int, dark_field_tilt: float) -> list[Li
     :param dark_field_tilt: rad.
     :raises PsError: CR_OUT_OF_LIMITS.
     """
-    tilt = float(BrightFieldKinematics(head).tilt(m_counts))
+    bright, dark = BrightFieldKinematics(head), DarkFieldKinematics(head)
     lights = []
-    for mode, prefix, field, angle in (
-            (Mode.BRIGHT_FIELD, 'BF', head.bright_field, tilt),
-            (Mode.DARK_FIELD, 'DF', head.dark_field, dark_field_tilt)):
+    for mode, prefix, ring, angle in (
+            (Mode.BRIGHT_FIELD, 'BF', bright.ring, float(bright.tilt(m_counts))),
+            (Mode.DARK_FIELD, 'DF', dark.ring, dark_field_tilt)):
         for name in DIRECTIONS:
-            pose = panel_pose(field, name, angle)  # type: ignore[arg-type]
+            pose = ring.pose(name, angle)  # type: ignore[arg-type]
             lights.append(Light(
                 name=f'{prefix}_{name}', mode=mode, panel=Panel[name],
                 position=_vector(pose.center), axis=_vector(pose.axis), right=_vector(pose.right),

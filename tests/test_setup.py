@@ -314,7 +314,7 @@ needs_setup = pytest.mark.skipif(
 @pytest.mark.parametrize('shell', shells())
 def test_env_sh_is_idempotent_under_strict_options(shell: str) -> None:
     script = ('set -eu; . ./env.sh; env | sort > "$1"; . ./env.sh; env | sort > "$2"; '
-              'command -v ps_cr ps_reconstruct ps_cell ps_demo python; '
+              'for c in ps_cr ps_reconstruct ps_cell ps_demo python; do command -v $c; done; '
               'case $- in *e*u*|*u*e*) echo strict ;; esac')
     pair = [f'/tmp/ps_env_{os.getpid()}_{shell}_{n}' for n in (1, 2)]
     try:

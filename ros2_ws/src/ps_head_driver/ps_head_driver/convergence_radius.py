@@ -239,9 +239,8 @@ class CrSolver:
             intervals[candidate] = (lowest, highest)
             best = self._refine(candidate, lambda cr: np.abs(cr - wanted))
             solution = self._at(int(best))
-            # beyond the last whole count of the branch by less than half a count is still reached
-            slack = abs(solution.dcr_dm) / 2
-            if lowest - slack <= wanted <= highest + slack:
+            # nearer than one count moves it; farther off lies beyond an end or in a gap of the branch
+            if abs(solution.convergence_radius - wanted) <= abs(solution.dcr_dm) + 1e-9:
                 return CrSolution(**{**vars(solution), 'reachable': (lowest, highest)})
         where = '; '.join(f'{name.name.lower()} {lowest * 1e3:.2f} to {highest * 1e3:.2f} mm'
                           for name, (lowest, highest) in intervals.items())

@@ -146,16 +146,22 @@ class CrSolver:
                           f'at m = {m_counts} (tilt {np.degrees(self._motor.tilt(m_counts)):.2f} '
                           'deg)')
         center, radius, residual = fit_circles(points)
-        low, high = self._motor.limits_counts
-        beside = np.clip(m[0] + np.array([-1.0, 1.0]), low, high)
-        cr, _ = self.evaluate(beside)
+        branch = Branch(int(self._branches(radial)[0]))
         return CrSolution(
             motor_counts=int(m_counts), tilt=float(self._motor.tilt(m_counts)),
             convergence_radius=2 * float(radius[0]),
             light_height=float(self._axes(m)[0][0, :, 2].mean()) - self.plane_z,
             residual=float(residual[0]), center=(float(center[0, 0]), float(center[0, 1])),
-            branch=Branch(int(self._branches(radial)[0])),
-            dcr_dm=float((cr[1] - cr[0]) / (beside[1] - beside[0])), reachable=(np.nan, np.nan))
+            branch=branch, dcr_dm=self._sensitivity(m[0], branch), reachable=(np.nan, np.nan))
+
+    def _sensitivity(self, m: float, branch: Branch) -> float:
+        """Central difference over one count, one-sided at the ends of the branch; m per count."""
+        low, high = self._motor.limits_counts
+        at = np.clip(m + np.array([-1.0, 0.0, 1.0]), low, high)
+        cr, branches = self.evaluate(at)
+        usable = branches == branch
+        at, cr = at[usable], cr[usable]
+        return float((cr[-1] - cr[0]) / (at[-1] - at[0])) if at[-1] > at[0] else 0.0
 
     # ------------------------------------------------------------------ inverse
 
@@ -239,7 +245,7 @@ class CrSolver:
             intervals[candidate] = (lowest, highest)
             best = self._refine(candidate, lambda cr: np.abs(cr - wanted))
             solution = self._at(int(best))
-            # nearer than one count moves it; farther off lies beyond an end or in a gap of the branch
+            # farther off than one count moves it lies beyond an end or in a gap of the branch
             if abs(solution.convergence_radius - wanted) <= abs(solution.dcr_dm) + 1e-9:
                 return CrSolution(**{**vars(solution), 'reachable': (lowest, highest)})
         where = '; '.join(f'{name.name.lower()} {lowest * 1e3:.2f} to {highest * 1e3:.2f} mm'

@@ -8,13 +8,14 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ps_head_driver.camera_model import scaled_camera
+from ps_head_driver.camera_model import pixel_rays, scaled_camera
 from ps_head_driver.fake import shading
-from ps_head_driver.fake.scenes import Scene
+from ps_head_driver.fake.scenes import SIZE, Scene, make_scene
 from ps_head_driver.frames import slope_to_normal
 from ps_head_driver.head_model import DIRECTIONS, CameraGeometry, HeadModel
 from ps_head_driver.kinematics import BrightFieldKinematics, DarkFieldKinematics, PanelPose
@@ -24,19 +25,22 @@ from ps_head_driver.stack import Truth
 COARSE = (6, 3)
 FINE = (12, 6)
 
+_DEEPEST, _BORDER = 0.010, 0.004     # m; a scene reaches this far below the plane, and aside
+
 OFF = (0.0, 0.0, 0.0, 0.0)
 
-# Radiance at the centre of a matt plate of albedo 0.8 under one panel of the nominal head at a tilt
-# of 30 degrees, in units of the panel's radiance: it fixes the camera's sensitivity.
+# Radiance at the centre of a matt plate of albedo 0.8 under one panel of the nominal head, tilted
+# by 30 degrees, in units of the panel's radiance: it fixes the camera's sensitivity. The edge of
+# the field that is nearest to the panel is 1.4 times as bright and must not saturate.
 _REFERENCE_RADIANCE = 0.014105
-_REFERENCE_LEVEL = 0.7
+_REFERENCE_LEVEL = 0.6
 
 
 @dataclass(frozen=True)
 class Sensor:
     """The camera behind the lens.
 
-    With the defaults a matt plate of albedo 0.8 under one panel at 30 degrees tilt fills 70 % of
+    With the defaults a matt plate of albedo 0.8 under one panel at 30 degrees tilt fills 60 % of
     the range at the picture's centre.
 
     :param bit_depth: 8 or 16.
@@ -119,17 +123,9 @@ def camera_rays(camera: CameraGeometry) -> tuple[NDArray, NDArray]:
 
     :returns: x and y, each (H * W,) float64.
     """
-    u, v = np.meshgrid(np.arange(camera.width_px, dtype=float),
-                       np.arange(camera.height_px, dtype=float))
-    if not any(camera.distortion):
-        return ((u - camera.cx) / camera.fx).ravel(), (-(v - camera.cy) / camera.fy).ravel()
-    import cv2
-    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-12)
-    straight = cv2.undistortPointsIter(
-        np.stack([u, v], axis=-1).reshape(-1, 1, 2), matrix, np.array(camera.distortion, float),
-        np.eye(3), np.eye(3), criteria)[:, 0]
-    return np.ascontiguousarray(straight[:, 0]), np.ascontiguousarray(-straight[:, 1])
+    v, u = np.mgrid[:camera.height_px, :camera.width_px]
+    rays = pixel_rays(camera, np.stack([u, v], axis=-1)).reshape(-1, 3)
+    return np.ascontiguousarray(rays[:, 0]), np.ascontiguousarray(rays[:, 1])
 
 
 class Renderer:
@@ -202,37 +198,65 @@ class Renderer:
         :returns: (H, W) float32 in units of a panel's radiance.
         """
         total = np.zeros(self._shape, np.float32)
-        for ring, angle, levels in ((self._bright, tilt, bf_levels),
-                                    (self._dark, df_tilt, df_levels)):
+        for panel_pose, angle, levels in ((self._bright.panel_pose, tilt, bf_levels),
+                                          (self._dark.panel_pose, df_tilt, df_levels)):
             for direction, level in zip(DIRECTIONS, levels, strict=True):
                 if level > 0:
-                    total += np.float32(level) * self.panel_radiance(
-                        ring.panel_pose(direction, angle))
+                    pose = panel_pose(direction, angle)  # type: ignore[arg-type]
+                    total += np.float32(level) * self.panel_radiance(pose)
         return total
 
     def render(self, tilt: float, df_tilt: float, bf_levels: Sequence[float],
                df_levels: Sequence[float] = OFF, exposure: float | None = None,
-               gain: float = 0.0, frame: int = 0) -> NDArray:
+               strobe: float | None = None, gain: float = 0.0, frame: int = 0) -> NDArray:
         """One picture.
 
-        :param exposure: time that the panels were on, s; the sensor's reference if None.
+        :param tilt, df_tilt, bf_levels, df_levels: see :meth:`radiance`.
+        :param exposure: time that the shutter was open, s; the sensor's reference if None.
+        :param strobe: time of it that the panels were on, s; all of it if None.
         :param gain: dB.
         :param frame: number of the frame; selects its noise.
         :returns: (H, W) uint8 or uint16.
         """
         sensor = self.sensor
-        duration = sensor.exposure if exposure is None else exposure
+        exposure = sensor.exposure if exposure is None else exposure
+        strobe = exposure if strobe is None else min(strobe, exposure)
         level = self.radiance(tilt, df_tilt, bf_levels, df_levels)
-        level *= np.float32(_REFERENCE_LEVEL / _REFERENCE_RADIANCE)
+        level *= np.float32(_REFERENCE_LEVEL / _REFERENCE_RADIANCE * strobe / sensor.exposure)
         if sensor.ambient:
-            level += np.float32(sensor.ambient) * self._points[5].reshape(self._shape)
-        level *= np.float32(duration / sensor.exposure)
+            level += (np.float32(sensor.ambient * exposure / sensor.exposure)
+                      * self._points[5].reshape(self._shape))
         if self._vignette is not None:
             level *= self._vignette
         return sensor.expose(level, gain, np.random.default_rng([self.seed, frame]))
+
+    def warm_up(self) -> None:
+        """Compile the kernels now, not with the first picture."""
+        points, self._points = self._points, self._points[:, :1]
+        shape, self._shape = self._shape, (1, 1)
+        try:
+            self.panel_radiance(self._bright.panel_pose('E', 0.5))
+        finally:
+            self._points, self._shape = points, shape
+            self._cache.clear()
 
     def truth(self) -> Truth:
         """True normals (n_plane) and heights where the pixels really look."""
         points = self._points.reshape(6, *self._shape)
         return Truth(normal=slope_to_normal(np.stack([points[3], points[4]], axis=-1)),
                      height=points[2].copy())
+
+
+def make_renderer(scene: str, head: HeadModel, sensor: Sensor | None = None, scale: float = 1.0,
+                  seed: int = 1, **parameters: Any) -> Renderer:
+    """Renderer for a scene by name, large enough for the head's field of view.
+
+    :param parameters: of the scene.
+    :raises PsError: SEQUENCER_BAD_REQUEST for an unknown scene or parameter.
+    """
+    rays = camera_rays(scaled_camera(head.camera, 64, 64))
+    reach = head.camera.camera_standoff + _DEEPEST
+    size = tuple(max(least, 2 * float(np.abs(along).max()) * reach + _BORDER)
+                 for least, along in zip(SIZE, rays, strict=True))
+    return Renderer(make_scene(scene, size=(size[0], size[1]), **parameters), head, sensor, scale,
+                    seed)

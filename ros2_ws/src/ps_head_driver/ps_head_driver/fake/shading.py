@@ -34,7 +34,7 @@ def _weights(t):  # type: ignore[no-untyped-def]
 @nb.njit(cache=True, inline='always')
 def _cell(u, n):  # type: ignore[no-untyped-def]
     """First of the four control points around grid coordinate u, and the fraction."""
-    i = min(max(int(math.floor(u)), 1), n - 3)
+    i = min(max(math.floor(u), 1), n - 3)
     return i - 1, min(max(u - i, 0.0), 1.0)
 
 
@@ -363,8 +363,8 @@ def shade(points, specular, alpha, coarse, coarse_panel, fine, fine_panel, corne
             dx = coarse_panel[5, 0] + along * coarse_panel[4, 0]
             dy = coarse_panel[5, 1] + along * coarse_panel[4, 1]
             length = math.sqrt(dx * dx + dy * dy)
-            horizons[a] = _horizon(surface, tops, wide_tops, top, x0, y0, pitch, x, y, z, dx / length,
-                                   dy / length, lowest, highest)
+            horizons[a] = _horizon(surface, tops, wide_tops, top, x0, y0, pitch, x, y, z,
+                                   dx / length, dy / length, lowest, highest)
         out[k] = intensity * _sum_emitters(
             fine, fine_panel, x, y, z, nx, ny, nz, vx, vy, vz, diffuse, specular, alpha,
             horizons, left, spacing)

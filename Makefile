@@ -28,7 +28,9 @@ test: lint  ## lint, then every test
 
 lint: setup  ## ruff and mypy over packages, scripts and tests
 	@$(IN_ENV) ruff check .
-	@$(IN_ENV) mypy scripts tests $(foreach p,$(PACKAGES),ros2_ws/src/$(p)/$(p))
+	@$(IN_ENV) mypy scripts $(foreach p,$(PACKAGES),ros2_ws/src/$(p)/$(p))
+	@$(IN_ENV) for tests in tests $(foreach p,$(PACKAGES),ros2_ws/src/$(p)/test); do \
+	  mypy --allow-untyped-defs $$tests || exit 1; done
 
 bench: setup  ## run the benchmarks in tests/bench and print their tables
 	@$(IN_ENV) python -m tests.bench

@@ -201,8 +201,8 @@ def reason(output: str) -> str:
     if 'No space left on device' in output:
         return 'the disk is full'
     if re.search(r'NewConnectionError|NameResolutionError|Failed to establish|ReadTimeout|'
-                 r'ProxyError|ConnectTimeout|Connection (?:broken|aborted|reset)|from versions: none',
-                 output):
+                 r'ProxyError|ConnectTimeout|Connection (?:broken|aborted|reset)|'
+                 r'from versions: none', output):
         return f'no answer from the package index; is there a network (or HTTPS_PROXY)? {see}'
     errors = re.findall(r'^(?:ERROR|error|CMake Error|fatal).*$|^.*: error: .*$', output, re.M)
     last = errors or [line for line in output.splitlines() if line.strip()]

@@ -119,13 +119,12 @@ class HeadClient:
 
     :param links: not yet connected; one has the motor, one (the same or another) the lights.
     :param limits: soft limits of the motor, counts.
-    :param on_state: called with every state that was read, from the thread that read it.
     """
 
-    def __init__(self, links: Sequence[SerialLink], limits: tuple[int, int],
-                 on_state: Callable[[HeadState], None] = lambda _: None) -> None:
+    def __init__(self, links: Sequence[SerialLink], limits: tuple[int, int]) -> None:
         self.links, self.limits = tuple(links), limits
-        self._on_state = on_state
+        # called with every state that was read, from the thread that read it
+        self.on_state: Callable[[HeadState], None] = lambda _: None
         self._motor: SerialLink | None = None
         self._lights: SerialLink | None = None
         self._gains: tuple[int, ...] = (protocol.FULL_LEVEL,) * PANELS
@@ -207,7 +206,7 @@ class HeadClient:
                                for t in lights.temperatures),
             steps_done=lights.steps_done, strobe_counter=lights.strobe_counter,
             trigger_counter=lights.trigger_counter)
-        self._on_state(state)
+        self.on_state(state)
         return state
 
     def clear_fault(self) -> HeadState:

@@ -45,15 +45,14 @@ class SerialLink:
     :param baud: bit/s.
     :param boot_s: how long a board may be silent after its port was opened (boards that restart
         then).
-    :param on_lost: called when an open link breaks, from the thread that noticed.
     """
 
-    def __init__(self, url: str, baud: int = 115200, boot_s: float = 0.0,
-                 on_lost: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, url: str, baud: int = 115200, boot_s: float = 0.0) -> None:
         self.url, self.baud, self._boot_s = url, baud, boot_s
+        # called when an open link breaks, from the thread that noticed
+        self.on_lost: Callable[[], None] = lambda: None
         self.statistics = LinkStatistics()
         self.info: BoardInfo | None = None         # of the board, while connected
-        self._on_lost = on_lost
         self._port: Any = None                      # a pyserial port of any kind
         self._reader: threading.Thread | None = None
         self._request_lock = threading.Lock()
@@ -217,7 +216,7 @@ class SerialLink:
         was_connected = self.connected
         self.close()
         if was_connected:
-            self._on_lost()
+            self.on_lost()
 
 
 def _reason(error: Exception) -> str:

@@ -73,7 +73,7 @@ def test_a_silent_board_is_a_time_out(bench: Bench) -> None:
 def test_unplugged_and_plugged_again(bench: Bench) -> None:
     link, control = bench
     lost = threading.Event()
-    link._on_lost = lost.set
+    link.on_lost = lost.set
     control.command('unplug')
     assert lost.wait(1.0)
     assert not link.connected

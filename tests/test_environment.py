@@ -5,8 +5,9 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 
-from ps_inspection.environment import cell_environment, fastdds_profile
 import pytest
+
+from ps_inspection.environment import cell_environment, fastdds_profile
 
 LARGEST_SEGMENT = """
 import re, rclpy

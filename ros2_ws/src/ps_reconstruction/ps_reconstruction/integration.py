@@ -148,7 +148,7 @@ def remove_plane(height: NDArray[np.float32], rounds: int = 3) -> NDArray[np.flo
         scale = 1.4826 * np.median(residual) + 1e-12
         weight = np.sqrt(1 / (1 + (residual / (2 * scale)) ** 2))
     rows, columns = height.shape
-    plane = (coefficients[0] * np.arange(columns)[None, :]
+    plane: NDArray = (coefficients[0] * np.arange(columns)[None, :]
              + coefficients[1] * np.arange(rows)[:, None] + coefficients[2])
     return height - plane.astype(np.float32)
 

@@ -68,11 +68,11 @@ def solve(problem: Problem, quality: bool = True, out: Solution | None = None) -
                 # the last group is filled up with a frame that counts nothing
                 chosen = [planes[c][min(GROUP * i + k, len(planes[c]) - 1)] for k in range(GROUP)]
                 _accumulate(*chosen, group, problem.step, first, scaled_normal[c])
+        _finish(scaled_normal, weights, result.normal[rows], albedo[rows])    # type: ignore
         mask = None if problem.mask is None else problem.mask[rows]
-        if mask is None:
-            _finish(scaled_normal, weights, result.normal[rows], albedo[rows])
-        else:
-            _finish_masked(scaled_normal, weights, mask, result.normal[rows], albedo[rows])
+        if mask is not None:
+            result.normal[rows][~mask] = np.nan
+            albedo[rows][~mask] = np.nan
         if not quality:
             return 0.0, 0.0, 0
         grey = np.tensordot(weights, scaled_normal, 1) if problem.colour else scaled_normal[0]
@@ -117,8 +117,8 @@ def solve_reference(problem: Problem) -> Solution:
         valid &= problem.mask
     with np.errstate(divide='ignore', invalid='ignore'):
         normal = np.where(valid[..., None], g / albedo[..., None], np.nan)
-    albedo = np.where(valid, albedo, np.nan)
-    return Solution(normal.astype(np.float32), albedo.astype(np.float32))
+    return Solution(
+        normal.astype(np.float32), np.where(valid, albedo, np.nan).astype(np.float32))
 
 
 def empty_solution(problem: Problem, quality: bool = True) -> Solution:
@@ -261,13 +261,6 @@ def _finish(total, weights, normal, albedo):    # type: ignore[no-untyped-def]
                 for c in range(channels):
                     albedo[y, x, c] = (sx * total[c, 0, y, x] + sy * total[c, 1, y, x]
                                        + sz * total[c, 2, y, x])
-
-
-def _finish_masked(total: NDArray, weights: NDArray, mask: NDArray, normal: NDArray,
-                   albedo: NDArray) -> None:
-    _finish(total, weights, normal, albedo)
-    normal[~mask] = np.nan
-    albedo[~mask] = np.nan
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_head_driver.stack import Stack
+from ps_head_driver.stack import Geometry, Stack
 from ps_reconstruction import integration, least_squares, preview, surface
 from ps_reconstruction.near_field import (
     check,
@@ -22,6 +22,7 @@ from ps_reconstruction.surface import Roughness
 from ps_reconstruction.weighted_integration import integrate
 
 METHODS = ('ls', 'stv')
+FORMS = ('auto', 'none', 'plane', 'slow')
 OUTPUTS = ('normal', 'slope', 'albedo', 'height', 'curvature', 'shape', 'confidence', 'preview',
            'roughness')
 
@@ -34,10 +35,12 @@ class Options:
     :param near_field: light vectors per pixel from the panel geometry.
     :param height_rounds: alternations of height and lighting, 0 for none.
     :param careful: integrate with confidence weights and masks instead of by cosine transform.
-    :param flatten_height: subtract the plane that fits the surface best from the height.
+    :param form: what is removed from the height: 'none', 'plane' (the one that fits best), 'slow'
+        (all slow form; the picture's longer side / 16) or 'auto': 'slow' where the lights are
+        assumed, so that their error is not taken for form, else 'none'.
     :param saturation: share of full scale that counts as saturated.
     :param smoothness: sigma of the smoothing of shape and curvature, px.
-    :param flattening: sigma above which slow form is removed from the shape, px; 0 takes a 30th of
+    :param flattening: length beyond which form is removed from the shape, px; 0 takes a 150th of
         the longer side.
     :param contrast: of the shape, 1 is normal.
     :param s_filter: roughness S-filter nesting index, m; 0 for none.
@@ -49,7 +52,7 @@ class Options:
     near_field: bool = True
     height_rounds: int = 2
     careful: bool = False
-    flatten_height: bool = False
+    form: str = 'auto'
     saturation: float = 0.98
     smoothness: float = 1.0
     flattening: float = 0.0
@@ -62,8 +65,9 @@ class Options:
         def refuse(name: str, what: str) -> None:
             raise PsError(ErrorCode.RECONSTRUCTION_BAD_PARAMETER,
                           f'{name}: {getattr(self, name)!r} {what}')
-        if self.method not in METHODS:
-            refuse('method', f'is not one of {", ".join(METHODS)}')
+        for name, choices in (('method', METHODS), ('form', FORMS)):
+            if getattr(self, name) not in choices:
+                refuse(name, f'is not one of {", ".join(choices)}')
         for name in ('smoothness', 'flattening', 's_filter', 'pixel_pitch', 'height_rounds'):
             if not 0 <= getattr(self, name) < float('inf'):
                 refuse(name, 'must not be negative')
@@ -158,7 +162,7 @@ def reconstruct(stack: Stack, options: Options | None = None,
                 solution.normal, pitch, options.smoothness)
     if 'preview' in wanted:
         with _timed(timings, 'preview'):
-            result.preview = preview.normal_picture(solution.normal)
+            result.preview = preview.normal_preview(solution.normal)
     return result
 
 
@@ -185,7 +189,7 @@ def _timed(timings: dict[str, float], stage: str) -> Iterator[None]:
 
 def _solve(problem: Problem, options: Options, quality: bool) -> Solution:
     if options.method == 'stv':
-        from ps_reconstruction import stv
+        from ps_reconstruction import stv  # loaded only when it is used
         return stv.solve(problem, quality=quality)
     return least_squares.solve(problem, quality=quality)
 
@@ -210,19 +214,25 @@ def _integrate(result: Reconstruction, stack: Stack, rays: integration.Rays, opt
                 solver = partial(integrate, confidence=solution.confidence, pitch=pitch)
             result.height = integration.height_from_normals(
                 result.normal, rays, plane.normal, plane.offset, solver)
-            if options.flatten_height:
+            form = options.form
+            if form == 'auto':
+                form = 'slow' if stack.geometry == Geometry.ASSUMED else 'none'
+            if form == 'plane':
                 result.height = integration.remove_plane(result.height)
+            elif form == 'slow':
+                result.height = surface.without_slow_form(result.height, max(stack.shape) / 16)
     if wanted & {'shape', 'roughness'}:
         du, dv = integration.gradients(result.normal, rays)
         # the perspective integral is ln(depth): higher is less
-        parallel = stack.camera is None
         metres = 1.0 if stack.camera is None else -result.pixel_pitch * stack.camera.fx
     if 'shape' in wanted:
         with _timed(timings, 'shape'):
-            relief = surface.band_passed(
-                du, dv, options.smoothness, options.flattening or max(stack.shape) / 30)
-            result.shape = surface.shape_image(
-                relief, result.mask, options.contrast * (1 if parallel else -1))
+            relief = surface.relief(
+                du, dv, solution.albedo, options.smoothness,
+                options.flattening or max(stack.shape) / 150)
+            # one pixel pitch of height in the unit of the integral
+            unit = result.pixel_pitch / metres
+            result.shape = surface.shape_image(relief, result.mask, options.contrast, unit)
     if 'roughness' in wanted and result.metric:
         with _timed(timings, 'roughness'):
             result.roughness = surface.roughness(

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 BACKGROUND = (255, 255, 255)
 
 
-def normal_picture(normal: NDArray[np.float32]) -> NDArray[np.uint8]:
+def normal_preview(normal: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Normals as colours, n_plane: red right, green up, blue towards the viewer; invalid black."""
     out = np.empty(normal.shape, np.uint8)
     _normal_rows(normal, out)
     return out
 
 
-def slope_picture(slope: NDArray[np.float32], full_scale: float | None = None
+def slope_preview(slope: NDArray[np.float32], full_scale: float | None = None
                   ) -> NDArray[np.uint8]:
     """Slopes on a colour wheel: hue is the downhill direction, saturation the steepness.
 

@@ -11,10 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ps_reconstruction.bands import for_bands
-from ps_reconstruction.integration import BAND, divergence, laplace_eigenvalues, solve_poisson
+from ps_reconstruction.integration import (
+    BAND,
+    divergence,
+    laplace_eigenvalues,
+    remove_plane,
+    solve_poisson,
+)
 
 # sigma of the ISO 16610 Gaussian over its cut-off wavelength: sqrt(ln 2 / 2) / pi
 SIGMA_PER_CUTOFF = float(np.sqrt(np.log(2) / 2) / np.pi)
+FLAT_RELIEF_PX = 1e-4         # least spread of the shape image, in pixel pitches of height
+DARK_SHARE = 0.25             # of the bright parts' albedo: there a slope counts half
 NEUTRAL = 128                 # grey of a flat surface in the shape-enhanced image
 
 
@@ -60,13 +68,57 @@ def mean_curvature(normal: NDArray[np.float32], pitch: float, sigma_px: float = 
     return out
 
 
+def relief(
+    du: NDArray[np.float32], dv: NDArray[np.float32], albedo: NDArray[np.float32],
+    short_px: float, long_px: float,
+) -> NDArray[np.float32]:
+    """Local relief for people to look at: fine form kept, slow form and dark noise subdued.
+
+    The slopes lose their local mean, so a bowl from imperfect lights does not show; dark pixels,
+    whose slopes are mostly noise, count less; the integration fades beyond ``long_px`` with one
+    pole (screened Poisson), which rings less at edges than a Gaussian high-pass.
+
+    :param du, dv: (H, W) gradients along columns and rows per pixel, NaN where unknown.
+    :param albedo: (H, W) or (H, W, 3), NaN where unknown.
+    :param short_px: sigma of the Gaussian smoothing.
+    :param long_px: length beyond which form is flattened away.
+    """
+    light = albedo if albedo.ndim == 2 else albedo.mean(axis=-1)
+    lattice = max(1, int(np.sqrt(light.size / 50000)))
+    bright = float(np.nanpercentile(light[::lattice, ::lattice], 95))
+    square = np.nan_to_num(light) ** 2
+    trust = square / (square + np.float32((DARK_SHARE * bright) ** 2))
+    factor = max(1, int(long_px / 4))
+    size = (max(1, du.shape[1] // factor), max(1, du.shape[0] // factor))
+
+    def local_mean(values: NDArray) -> NDArray:
+        small = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
+        return np.asarray(cv2.GaussianBlur(small, (0, 0), long_px / factor))
+
+    weight = local_mean(trust) + np.float32(1e-6)
+    flat = []
+    for gradient in (du, dv):
+        known = np.nan_to_num(gradient)
+        mean = cv2.resize(local_mean(known * trust) / weight, du.shape[::-1],
+                          interpolation=cv2.INTER_LINEAR)
+        flat.append((known - mean) * trust)
+    right = divergence(flat[0], flat[1])
+    column, row = (laplace_eigenvalues(n).astype(np.float32) for n in right.shape)
+    response = column[:, None] + row
+    response = np.exp(np.float32(0.5 * short_px ** 2) * response) * (
+        response / (response - np.float32(1 / long_px ** 2)))
+    return solve_poisson(right, response)
+
+
 def shape_image(
     relief: NDArray[np.float32], valid: NDArray[np.bool_], contrast: float = 1.0,
+    unit_px: float = 1.0,
 ) -> NDArray[np.uint8]:
     """Grey picture of a relief: raised bright, sunk dark, flat and invalid pixels mid-grey.
 
-    :param relief: (H, W) band-passed height, any unit.
-    :param contrast: 1 maps three robust standard deviations to 76 % of the range; what stands out
+    :param relief: (H, W), any unit.
+    :param unit_px: what one pixel pitch of height is in that unit; negative if it counts down.
+    :param contrast: 1 maps three robust standard deviations to half the range; what stands out
         further is compressed, not clipped.
     """
     lattice = max(1, int(np.sqrt(relief.size / 50000)))
@@ -74,9 +126,11 @@ def shape_image(
     if sample.size == 0:
         return np.full(relief.shape, NEUTRAL, np.uint8)
     middle = np.float32(np.median(sample))
-    spread = max(1.4826 * float(np.median(np.abs(sample - middle))), 1e-30)
+    spread = 1.4826 * float(np.median(np.abs(sample - middle)))
+    # a perfectly flat part stays grey instead of showing its rounding errors
+    spread = max(spread, FLAT_RELIEF_PX * abs(unit_px))
     out = np.empty(relief.shape, np.uint8)
-    gain = np.float32(contrast / (3 * spread))
+    gain = np.float32(np.copysign(contrast / (3 * spread), unit_px))
     for_bands(len(relief), BAND, lambda i, j: _grey_rows(
         relief[i:j], valid[i:j], middle, gain, out[i:j]))
     return out
@@ -140,6 +194,24 @@ def roughness(
         sdq=float(np.sqrt(square.mean())), sdr=float(np.sqrt(1 + square).mean() - 1))
 
 
+def without_slow_form(height: NDArray[np.float32], long_px: float) -> NDArray[np.float32]:
+    """Height less its local mean over about ``long_px``; median 0.
+
+    A plane goes first, so that the borders do not bend.
+    """
+    height = remove_plane(height)
+    valid = np.isfinite(height)
+    factor = max(1, int(long_px / 16))
+    size = (max(1, height.shape[1] // factor), max(1, height.shape[0] // factor))
+    share = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    total = cv2.resize(np.nan_to_num(height), size, interpolation=cv2.INTER_AREA)
+    mean = smooth(np.asarray(total / np.maximum(share, np.float32(1e-6)), np.float32),
+                  share > 0.5, long_px / factor)
+    height = height - np.asarray(cv2.resize(
+        mean, height.shape[::-1], interpolation=cv2.INTER_LINEAR))
+    return height - np.float32(np.nanmedian(height)) if valid.any() else height
+
+
 def smooth(values: NDArray[np.float32], valid: NDArray[np.bool_], sigma_px: float
            ) -> NDArray[np.float32]:
     """Gaussian filter that takes nothing from invalid pixels.
@@ -174,5 +246,6 @@ def _grey_rows(relief, valid, middle, gain, out):    # type: ignore[no-untyped-d
         for x in range(width):
             grey = np.float32(0)
             if valid[y, x]:
-                grey = np.tanh((relief[y, x] - middle) * gain)
+                value = (relief[y, x] - middle) * gain
+                grey = value / (np.float32(1) + abs(value))
             out[y, x] = np.uint8(np.float32(NEUTRAL) + np.float32(127) * grey + np.float32(0.5))

@@ -46,7 +46,7 @@ def session(folder: Path, data: bytes, count: int, sync: bool, compression: str)
     acknowledged = []
     begin = time.perf_counter()
     writer = SessionWriter(folder, [STACK], WriterOptions(
-        compression, queue_bytes=2 * TOTAL_BYTES, sync=sync, min_free_bytes=0))
+        compression, queue_bytes=len(data) * count, sync=sync, min_free_bytes=0))
     for i in range(count):
         assert writer.write(STACK.name, data, i, i,
                             lambda: acknowledged.append(time.perf_counter()))

@@ -95,10 +95,14 @@ def _each_stack(
                 action(stack, unfinished)
                 unfinished.rename(out / name)
                 outcome.done += 1
-            except PsError as error:
+            except OSError:
+                raise                       # the disk, not the stack
+            except Exception as error:
                 shutil.rmtree(unfinished, ignore_errors=True)
-                outcome.failed[name] = error.message
-                progress(f'{name}: {error.message}')
+                reason = error.message if isinstance(error, PsError) else (
+                    f'{type(error).__name__}: {error}')
+                outcome.failed[name] = reason
+                progress(f'{name}: {reason}')
                 continue
         on_stack(stack, name)
         progress(name)
@@ -109,9 +113,11 @@ def _each_stack(
 def _stacks(session: Session, scan: Scan, outcome: Outcome) -> Iterator[Stack]:
     for number, message in enumerate(session.stacks(scan)):
         try:
-            yield message_to_stack(message)
-        except PsError as error:
-            outcome.failed[f'{number:06d}'] = error.message
+            stack = message_to_stack(message)
+        except Exception as error:      # a foreign or hostile message can be wrong in any way
+            outcome.failed[f'{number:06d}'] = f'no valid stack: {type(error).__name__}: {error}'
+        else:
+            yield stack
 
 
 def _claim(out: Path, session: Session) -> None:

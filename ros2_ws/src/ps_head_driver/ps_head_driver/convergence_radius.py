@@ -155,13 +155,16 @@ class CrSolver:
             branch=branch, dcr_dm=self._sensitivity(m[0], branch), reachable=(np.nan, np.nan))
 
     def _sensitivity(self, m: float, branch: Branch) -> float:
-        """Central difference over one count, one-sided at the ends of the branch; m per count."""
+        """Change of CR to the next count on the branch, m per count.
+
+        Of the two neighbours the one with the smaller change: four points of a very asymmetric head
+        may have two circles that fit equally well, and CR jumps where the better one changes.
+        """
         low, high = self._motor.limits_counts
         at = np.clip(m + np.array([-1.0, 0.0, 1.0]), low, high)
         cr, branches = self.evaluate(at)
-        usable = branches == branch
-        at, cr = at[usable], cr[usable]
-        return float((cr[-1] - cr[0]) / (at[-1] - at[0])) if at[-1] > at[0] else 0.0
+        changes = np.diff(cr)[(np.diff(at) > 0) & (branches[:-1] == branches[1:])]
+        return float(changes[np.argmin(np.abs(changes))]) if len(changes) else 0.0
 
     # ------------------------------------------------------------------ inverse
 

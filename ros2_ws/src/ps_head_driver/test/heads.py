@@ -12,7 +12,7 @@ def random_head(rng: np.random.Generator, tolerance: float = 1.0) -> HeadModel:
     field = data['bright_field']
     for section, keys in ((field['hinge'], 'rz'), (field['arm'], ('along',))):
         for key in keys:
-            section[key] *= rng.uniform(0.9, 1.1)
+            section[key] *= rng.uniform(0.95, 1.05)
     field['arm']['out'] = rng.uniform(-0.005, 0.005)
     field['rod_length'] *= rng.uniform(0.97, 1.05)
     field['crank']['radius'] *= rng.uniform(0.9, 1.0)

@@ -144,7 +144,8 @@ class Cell:
         deadline = self._started + self.ready_timeout
         namespace = self._starts[0].namespace if self._starts else ''
         context = Context()
-        context.init(domain_id=_domain_id(self.environment))
+        # args: not those of this process, which rcl would take for remapping rules
+        context.init(args=[], domain_id=_domain_id(self.environment))
         executor = SingleThreadedExecutor(context=context)
         monitor = Node(f'ps_cell_{os.getpid()}', namespace=namespace, context=context,
                        enable_rosout=False, start_parameter_services=False)

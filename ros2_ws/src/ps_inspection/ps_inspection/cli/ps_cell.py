@@ -9,7 +9,6 @@ import time
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from ps_head_driver.errors import PsError
 from ps_head_driver.graph import arguments_of
@@ -51,10 +50,11 @@ def main(argv: Sequence[str] | None = None) -> None:
         if not separator:
             parser.error(f'{word!r} is not NAME:=VALUE')
         values[name] = value
-    console = Console()
+    console = Console(highlight=False)
 
     def show(node: NodeProcess) -> None:
-        console.print(f'[green]ready[/] {node.name:20} {node.ready_s:5.1f} s')
+        console.print(f'[green]ready[/] {node.name:20} {node.ready_s:5.1f} s   '
+                      f'pid {node.process.pid}')
 
     try:
         cell = Cell(values, log_folder=options.log_folder, ready_timeout=options.ready_timeout,
@@ -91,16 +91,14 @@ def _interrupt() -> None:
 
 
 def _show(console: Console, cell: Cell, report: dict[str, Any]) -> None:
-    table = Table('node', 'pid', 'ready after', 'log')
     for node in cell.processes:
-        table.add_row(node.name, str(node.process.pid), f'{node.ready_s:.1f} s', str(node.log))
         report['nodes'].append({'name': node.name, 'pid': node.process.pid,
                                 'ready_s': node.ready_s, 'log': str(node.log)})
-    console.print(table)
     if cell.head_status is not None:
         report['head_state'] = _STATES[cell.head_status.state]
         kind = 'emulated head' if cell.head_status.fake else 'head'
         console.print(f'{kind}: {report["head_state"]} {cell.head_status.message}')
+    console.print(f'logs: {cell.log_folder}', soft_wrap=True)
     console.print('Ctrl-C stops the cell')
 
 

@@ -14,7 +14,6 @@ _RIM = (0.0160, 0.0176)          # raised ring, inner and outer radius
 _RIM_HEIGHT = 2.5e-4
 _THICKNESS = 1.5e-3
 _FEED = 4e-4                     # turning marks: tool advance per revolution
-_GLYPH_SCALE = 16                # pixels per millimetre of the stamp's drawing, times 4
 
 
 def _smoothstep(edge0: float, edge1: float, x: NDArray) -> NDArray:
@@ -37,12 +36,25 @@ def machined_disc(x: NDArray, y: NDArray, text: str = '0427', seed: int = 7,
                         - _smoothstep(_RIM[1] - 2e-4, _RIM[1] + 2e-4, r))
     # centre bore: countersunk at 30 degrees, flat bottom
     z -= np.clip((3.2e-3 - r) * math.tan(math.radians(30)), 0.0, 8e-4)
-    z -= _stamp(x, y, text, stamp_depth, centre=(0.0, 0.0092), height=3.6e-3)
-    z -= _stamp(x, y, 'PS HEAD', 0.7 * stamp_depth, centre=(0.0, -0.0095), height=2.0e-3)
+    def within(cx: float, cy: float, reach: float) -> tuple[slice, slice]:
+        """Rows and columns of the grid around a point: most features are small."""
+        columns = np.flatnonzero(np.abs(x[0] - cx) <= reach)
+        rows = np.flatnonzero(np.abs(y[:, 0] - cy) <= reach)
+        if not (columns.size and rows.size):
+            return slice(0), slice(0)
+        return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+
+    for label, depth, cy, letter in ((text, stamp_depth, 0.0092, 3.6e-3),
+                                     ('PS HEAD', 0.7 * stamp_depth, -0.0095, 2.0e-3)):
+        part = within(0.0, cy, 0.0135)
+        z[part] -= _stamp(x[part], y[part] - cy, label, depth, letter)
     for _ in range(9):
-        z += _scratch(x, y, random)
-    z += _ding(x, y, centre=(-0.0095, -0.0030), radius=7e-4, depth=6e-5)
-    z += _ding(x, y, centre=(0.0105, 0.0048), radius=4e-4, depth=4e-5)
+        cx, cy = random.uniform(-0.011, 0.011, 2)
+        part = within(cx, cy, 0.006)
+        z[part] += _scratch(x[part] - cx, y[part] - cy, random)
+    for cx, cy, radius, depth in ((-0.0095, -0.0030, 7e-4, 6e-5), (0.0105, 0.0048, 4e-4, 4e-5)):
+        part = within(cx, cy, 4 * radius)
+        z[part] += _ding(np.hypot(x[part] - cx, y[part] - cy) / radius, depth)
     # chamfer and wall down to the table
     chamfer = np.clip(r - (_RADIUS - 5e-4), 0.0, None)
     z = np.maximum(np.where(r < _RADIUS, z - chamfer, -1.0), -_THICKNESS)
@@ -62,8 +74,7 @@ def _turning_marks(r: NDArray, random: np.random.Generator) -> NDArray:
     return envelope * np.cos(2 * np.pi * turn)
 
 
-def _stamp(x: NDArray, y: NDArray, text: str, depth: float, centre: tuple[float, float],
-           height: float) -> NDArray:
+def _stamp(x: NDArray, y: NDArray, text: str, depth: float, height: float) -> NDArray:
     """Depth of stamped characters: rounded grooves, with the metal pushed up beside them; m."""
     import cv2
     pixel = height / 120
@@ -75,8 +86,8 @@ def _stamp(x: NDArray, y: NDArray, text: str, depth: float, centre: tuple[float,
     profile = depth * (1 - _smoothstep(0.0, groove, distance))
     profile -= 0.12 * depth * np.exp(-((distance - 1.35 * groove) / (0.35 * groove)) ** 2)
     profile = cv2.GaussianBlur(profile, (0, 0), 3.0).astype(np.float32)
-    column = (x - centre[0]) / pixel + (canvas.shape[1] - 1) / 2
-    row = (centre[1] - y) / pixel + 130
+    column = x / pixel + (canvas.shape[1] - 1) / 2
+    row = 130 - y / pixel
     return cv2.remap(profile, column.astype(np.float32), row.astype(np.float32),
                      cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
 
@@ -84,20 +95,17 @@ def _stamp(x: NDArray, y: NDArray, text: str, depth: float, centre: tuple[float,
 def _scratch(x: NDArray, y: NDArray, random: np.random.Generator) -> NDArray:
     """A straight or slightly bent groove with raised lips that runs out at both ends; m."""
     along = random.uniform(0, math.pi)
-    cx, cy = random.uniform(-0.011, 0.011, 2)
     length, bend = random.uniform(3e-3, 9e-3), random.uniform(-8, 8)
     width, depth = random.uniform(7e-5, 1.3e-4), random.uniform(6e-6, 2e-5)
-    u = (x - cx) * math.cos(along) + (y - cy) * math.sin(along)
-    v = -(x - cx) * math.sin(along) + (y - cy) * math.cos(along) - bend * u * u
+    u = x * math.cos(along) + y * math.sin(along)
+    v = y * math.cos(along) - x * math.sin(along) - bend * u * u
     ends = 1 - _smoothstep(0.35 * length, 0.5 * length, np.abs(u))
     shape = np.exp(-(v / width) ** 2) - 0.35 * np.exp(-((np.abs(v) - 2 * width) / width) ** 2)
     return -depth * ends * shape
 
 
-def _ding(x: NDArray, y: NDArray, centre: tuple[float, float], radius: float,
-          depth: float) -> NDArray:
-    """A round dent with a raised rim; m."""
-    d = np.hypot(x - centre[0], y - centre[1]) / radius
+def _ding(d: NDArray, depth: float) -> NDArray:
+    """A round dent with a raised rim, d radii from its centre; m."""
     return depth * (0.25 * np.exp(-((d - 1.3) / 0.3) ** 2) - np.exp(-d ** 4))
 
 

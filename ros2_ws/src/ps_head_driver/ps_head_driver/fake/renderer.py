@@ -21,9 +21,9 @@ from ps_head_driver.head_model import DIRECTIONS, CameraGeometry, HeadModel
 from ps_head_driver.kinematics import BrightFieldKinematics, DarkFieldKinematics, PanelPose
 from ps_head_driver.stack import Truth
 
-#: Emitters along a panel's width and height where it is fully visible, and where it is partly so.
-COARSE = (6, 3)
-FINE = (12, 6)
+#: Emitters along a panel's width and height: where all of a matt or a glossy point's panel is
+#: visible, and where part of it is.
+MATT, GLOSSY, PARTIAL = (5, 3), (12, 6), (12, 6)
 
 _DEEPEST, _BORDER = 0.010, 0.004     # m; a scene reaches this far below the plane, and aside
 
@@ -92,22 +92,29 @@ class Sensor:
         return grey.astype(np.uint8 if self.bit_depth == 8 else np.uint16)
 
 
-def emitters(pose: PanelPose, count: tuple[int, int]) -> tuple[NDArray, NDArray]:
-    """Divide a panel into equal parts.
+def emitters(pose: PanelPose, count: tuple[int, int], gauss: bool) -> tuple[NDArray, NDArray]:
+    """Sample a panel.
 
-    :param count: parts along width and height.
-    :returns: centres of the parts (E, 3) and the panel's description for shading.shade (6, 3).
+    :param count: emitters along width and height.
+    :param gauss: at the nodes of Gauss-Legendre quadrature, the most exact where the integrand is
+        smooth; otherwise at the centres of equal parts.
+    :returns: (E, 4) positions and areas, and the panel as shading.shade wants it (6, 3).
     """
-    (width, height), (across, along) = pose.size, count
+    rules = [np.polynomial.legendre.leggauss(n) if gauss
+             else ((2 * np.arange(n) + 1) / n - 1, np.full(n, 2 / n)) for n in count]
+    (u, across), (v, along) = rules
+    width, height = pose.size
     up = np.cross(pose.axis, pose.right)
-    u = ((np.arange(across) + 0.5) / across - 0.5) * width
-    v = ((np.arange(along) + 0.5) / along - 0.5) * height
-    centres = (pose.center + u[:, None, None] * pose.right + v[None, :, None] * up).reshape(-1, 3)
+    samples = np.empty((*count, 4))
+    samples[..., :3] = (pose.center + width / 2 * u[:, None, None] * pose.right
+                        + height / 2 * v[:, None] * up)
+    samples[..., 3] = np.outer(across, along) * width * height / 4
     azimuth = math.atan2(pose.center[1], pose.center[0])
     forward = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
     sideways = np.array([-forward[1], forward[0], 0.0])
-    part = np.array([width / across, height / along, pose.lobe_exponent])
-    return centres, np.stack([pose.axis, pose.right, up, part, sideways, forward])
+    part = np.array([width / count[0], height / count[1], pose.lobe_exponent])
+    return (samples.reshape(-1, 4),
+            np.stack([pose.axis, pose.right, up, part, sideways, forward]))
 
 
 def corners(pose: PanelPose) -> NDArray:
@@ -178,7 +185,8 @@ class Renderer:
         with shading.KERNEL_LOCK:
             radiance = shading.shade(
                 self._points, self.scene.specular, self.scene.roughness,
-                *emitters(pose, COARSE), *emitters(pose, FINE), corners(pose), pose.intensity,
+                *emitters(pose, GLOSSY if self.scene.specular else MATT, gauss=True),
+                *emitters(pose, PARTIAL, gauss=False), corners(pose), pose.intensity,
                 *self._shadow_grids, self.scene.height_range[1], *self.scene.origin,
                 self.scene.pitch, self.camera.camera_standoff).reshape(self._shape)
         radiance.flags.writeable = False

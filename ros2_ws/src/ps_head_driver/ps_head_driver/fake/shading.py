@@ -251,6 +251,7 @@ def _sum_emitters(emitters, panel, x, y, z, nx, ny, nz, vx, vy, vz, diffuse, spe
 
     An emitter stands for its part of the panel, so one that the horizon cuts counts in part.
 
+    :param emitters: (E, 4) position and area.
     :param panel: rows: axis, right, up, (part width, part height, lobe exponent), sideways,
         forward; the last two are the horizontal unit vectors that horizons refer to.
     :param horizons: (K,) tangents at equal steps of sideways / forward, from ``first``; none: all
@@ -286,8 +287,8 @@ def _sum_emitters(emitters, panel, x, y, z, nx, ny, nz, vx, vy, vz, diffuse, spe
         reflected = _reflection(nx, ny, nz, lx, ly, lz, vx, vy, vz, cos_l, diffuse, specular,
                                 alpha)
         lobe_gain = cos_e if lobe == 1.0 else cos_e ** lobe
-        radiance += seen * reflected * lobe_gain * cos_l / square
-    return radiance * panel[3, 0] * panel[3, 1]
+        radiance += seen * reflected * lobe_gain * cos_l / square * emitters[e, 3]
+    return radiance
 
 
 @nb.njit(cache=True, parallel=True, fastmath=True)
@@ -301,8 +302,8 @@ def shade(points, specular, alpha, coarse, coarse_panel, fine, fine_panel, corne
     :param points: (6, N) float32 as from :func:`intersect`.
     :param specular: normal-incidence reflectance of the gloss; 0 for a matt surface.
     :param alpha: GGX roughness of the gloss.
-    :param coarse: (E, 3) emitters and (6, 3) panel, see :func:`_sum_emitters`.
-    :param fine: (F, 3), the same panel in smaller parts.
+    :param coarse: (E, 4) emitters and (6, 3) panel, see :func:`_sum_emitters`.
+    :param fine: (F, 4), the same panel in smaller parts.
     :param corners: (4, 3) of the panel.
     :param intensity: radiance of the panel.
     :returns: (N,) float32.

@@ -157,8 +157,8 @@ class CrSolver:
     def _sensitivity(self, m: float, branch: Branch) -> float:
         """Change of CR to the next count on the branch, m per count.
 
-        Of the two neighbours the one with the smaller change: four points of a very asymmetric head
-        may have two circles that fit equally well, and CR jumps where the better one changes.
+        Of the two neighbours the one with the smaller change: four points of a very asymmetric
+        head may have two circles that fit equally well, and CR jumps where the better one changes.
         """
         low, high = self._motor.limits_counts
         at = np.clip(m + np.array([-1.0, 0.0, 1.0]), low, high)

@@ -1,13 +1,25 @@
 """Heads for tests: the nominal one and random ones around it."""
 import numpy as np
 
+from ps_head_driver.errors import PsError
 from ps_head_driver.head_model import DIRECTIONS, HeadModel, load_head, nominal_head_path
+from ps_head_driver.kinematics import BrightFieldKinematics
 
 NOMINAL = load_head(nominal_head_path())
 
 
 def random_head(rng: np.random.Generator, tolerance: float = 1.0) -> HeadModel:
-    """A head of other dimensions that still covers its tilt range, its panels a little off."""
+    """A head of other dimensions that can be assembled, its panels a little off."""
+    while True:
+        head = _any_head(rng, tolerance)
+        try:
+            BrightFieldKinematics(head)
+        except PsError:
+            continue
+        return head
+
+
+def _any_head(rng: np.random.Generator, tolerance: float) -> HeadModel:
     data = NOMINAL.model_dump()
     field = data['bright_field']
     for section, keys in ((field['hinge'], 'rz'), (field['arm'], ('along',))):

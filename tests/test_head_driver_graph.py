@@ -50,11 +50,11 @@ class Graph:
         self._clients: dict[str, Any] = {}
         self.process = self.start()
 
-    def start(self) -> subprocess.Popen:
+    def start(self, *parameters: str) -> subprocess.Popen:
+        parameters = parameters or ('fake_hardware:=true', f'trigger_socket:={self.socket}')
         self.process = subprocess.Popen(
             [sys.executable, '-m', 'ps_head_driver.nodes.head_driver', '--ros-args',
-             '-r', '__ns:=/cell', '-p', 'fake_hardware:=true',
-             '-p', f'trigger_socket:={self.socket}'],
+             '-r', '__ns:=/cell', *(word for text in parameters for word in ('-p', text))],
             env={**os.environ, 'ROS_DOMAIN_ID': str(DOMAIN)})
         return self.process
 
@@ -355,3 +355,41 @@ def test_sigterm_and_a_bad_file_have_clean_exits(graph: Graph) -> None:
         env={**os.environ, 'ROS_DOMAIN_ID': str(DOMAIN)}, check=False)
     assert bad.returncode == 1
     assert 'HEAD_BAD_REQUEST: /nowhere/head.yaml' in bad.stderr
+
+
+def test_two_boards_on_two_serial_ports(graph: Graph, tmp_path: Path) -> None:
+    if graph.process.poll() is None:
+        graph.end()
+    motor, lights, socket = (tmp_path / name for name in ('motor', 'lights', 'trigger.sock'))
+    emulator = subprocess.Popen(
+        [sys.executable, '-m', 'ps_head_driver.fake.emulator_process', '--port', motor,
+         '--lights-port', lights, '--trigger-socket', socket], stdout=subprocess.PIPE)
+    try:
+        assert emulator.stdout is not None
+        assert emulator.stdout.readline().startswith(b'ready')
+        seen = len(graph.statuses)
+        graph.start(f'port:={motor}', f'lights_port:={lights}')
+        assert not graph.ready(newer_than=seen).fake
+        answer = graph.call(SetIllumination, 'set_illumination',
+                            illuminate(by=MOVE, motor_counts=20000))
+        assert answer.success, answer.message
+        program = graph.call(RunStrobeProgram, f'{NODE}/run_strobe_program',
+                             RunStrobeProgram.Request(steps=ring()))
+        assert program.success, program.message
+        assert [light.motor_counts for light in program.lights] == [20000] * 4
+
+        # killed while moving: the boards are left alone, and their watchdogs act
+        graph.ask(SetIllumination, 'set_illumination', illuminate(by=MOVE, motor_counts=64000))
+        with ControlClient(socket) as control:
+            graph.wait_status(lambda s: s.state == HeadStatus.MOVING)
+            graph.process.send_signal(signal.SIGKILL)
+            start = time.monotonic()
+            while control.command('state')['activity'] != 'IDLE':
+                assert time.monotonic() - start < 0.55
+                time.sleep(0.005)
+        graph.process.wait()
+    finally:
+        emulator.terminate()
+        assert emulator.wait(5) == 0
+    assert not motor.is_symlink()
+    assert not socket.exists()

@@ -2,6 +2,7 @@
 from collections.abc import Callable
 import contextlib
 from dataclasses import dataclass
+import os
 import random
 import threading
 from typing import Any
@@ -221,7 +222,7 @@ class SerialLink:
 
 def _reason(error: Exception) -> str:
     """One line of what the system says, without pyserial's repetitions."""
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
+    if isinstance(error, OSError) and error.errno:
+        return os.strerror(error.errno)
     return ' '.join(str(error).split()) or type(error).__name__
 

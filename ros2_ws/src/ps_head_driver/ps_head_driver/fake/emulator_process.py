@@ -141,16 +141,22 @@ class FakeHead:
 
         :param wake: further file descriptors that wake up the loop.
         """
-        self._plug()
+        self.plug()
         while not ended():
             now_ns = time.monotonic_ns()
             if self._plug_at_ns is not None and now_ns >= self._plug_at_ns:
-                self._plug()
+                self.plug()
             for channel in self.channels:
                 channel.serve(now_ns)
             for client, message in self.server.service():
                 self.server.reply(client, self._control(message))
             self._sleep(wake)
+
+    def plug(self) -> None:
+        """Make the ports appear."""
+        self._plug_at_ns = None
+        for channel in self.channels:
+            channel.pty.plug()
 
     def _sleep(self, wake: list[Any]) -> None:
         times = [self._plug_at_ns]
@@ -209,9 +215,7 @@ class FakeHead:
         return {}
 
     def _plug(self) -> dict[str, Any]:
-        self._plug_at_ns = None
-        for channel in self.channels:
-            channel.pty.plug()
+        self.plug()
         return {}
 
     def _reset(self) -> dict[str, Any]:
@@ -287,8 +291,9 @@ def main(arguments: list[str] | None = None) -> int:
             stop_at.append(time.monotonic() + ORPHAN_LIFE_S)
         return bool(stop_at) and time.monotonic() >= min(stop_at)
 
-    print(f'ready: {options.port}', flush=True)
     try:
+        fake.plug()
+        print(f'ready: {options.port}', flush=True)
         fake.run(ended, wake)
     finally:
         fake.close()

@@ -333,14 +333,16 @@ class HeadDriver(LifecycleNode):
         if snapshot.boards:
             status.firmware_version = '.'.join(map(str, snapshot.boards[-1].firmware))
             status.serial_number = snapshot.boards[0].serial
-        self._log(f'{snapshot.phase.name}' + (f': {error.message}' if error else ''),
-                  bool(error))
+        if error is not None:
+            self._log(f'{snapshot.phase.name}: {error.message}', True)
+        elif snapshot.phase in (Phase.CONNECTED, Phase.READY):
+            self._log(f'{snapshot.phase.name}: head {status.serial_number}', False)
         # after a signal the context is gone before this node is closed
         with suppress(RCLError, InvalidHandle):
             self._status.publish(status)
 
     def _log(self, text: str, is_error: bool) -> None:
-        """Say each state once."""
+        """Say what is not routine, once."""
         if text != self._last_logged and self._supervisor and self.context.ok():
             self._last_logged = text
             if is_error:

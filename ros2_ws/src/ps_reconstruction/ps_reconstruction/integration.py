@@ -133,12 +133,11 @@ def remove_plane(height: NDArray[np.float32], rounds: int = 3) -> NDArray[np.flo
     """
     step = max(1, int(np.sqrt(height.size / 20000)))
     sample = height[::step, ::step].astype(np.float64)
-    y, x = (axis * step for axis in np.indices(sample.shape))
-    known = np.isfinite(sample)
-    if known.sum() < 3:
+    y, x = np.nonzero(np.isfinite(sample))
+    if len(x) < 3:
         return height
-    design: NDArray = np.stack([x[known], y[known], np.ones(known.sum())], axis=-1)
-    values = sample[known]
+    values = sample[y, x]
+    design = np.stack([x * step, y * step, np.ones(len(x))], axis=-1)
     weight: NDArray = np.ones(len(values))
     coefficients: NDArray = np.zeros(3)
     for _ in range(rounds):

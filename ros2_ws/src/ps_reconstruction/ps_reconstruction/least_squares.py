@@ -66,9 +66,10 @@ def solve(problem: Problem, quality: bool = True, out: Solution | None = None) -
         for c in range(channels):
             for i, group in enumerate(groups):
                 # the last group is filled up with a frame that counts nothing
-                chosen = [planes[c][min(GROUP * i + k, len(planes[c]) - 1)] for k in range(GROUP)]
-                _accumulate(*chosen, group, problem.step, first, scaled_normal[c])
-        _finish(scaled_normal, weights, result.normal[rows], albedo[rows])    # type: ignore
+                f0, f1, f2, f3 = (
+                    planes[c][min(GROUP * i + k, len(planes[c]) - 1)] for k in range(GROUP))
+                _accumulate(f0, f1, f2, f3, group, problem.step, first, scaled_normal[c])
+        _finish(scaled_normal, weights, result.normal[rows], albedo[rows])
         mask = None if problem.mask is None else problem.mask[rows]
         if mask is not None:
             result.normal[rows][~mask] = np.nan
@@ -154,8 +155,7 @@ def check_lights(lights: NDArray) -> None:
 def pseudo_inverse(lights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Pseudo-inverse of the light matrix at every node, (gh, gw, T, 3) to (gh, gw, 3, T)."""
     check_lights(lights)
-    inverse: NDArray[np.float64] = np.linalg.pinv(lights)
-    return inverse
+    return np.asarray(np.linalg.pinv(lights), np.float64)
 
 
 def _grouped(inverse: NDArray) -> list[NDArray[np.float32]]:

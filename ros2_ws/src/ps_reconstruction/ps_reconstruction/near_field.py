@@ -189,7 +189,7 @@ def surface_heights(stack: Stack, rounds: int, tolerance: float = 2e-5
             solver=lambda du, dv, p=pitch: integrate(    # type: ignore[misc]
                 du, dv, steepness=0, pitch=p))
         height[~np.isfinite(height)] = 0
-        height = cv2.GaussianBlur(height, (0, 0), step / 2)
+        height = np.asarray(cv2.GaussianBlur(height, (0, 0), step / 2))
         new = _sample(height, columns, rows)
         change = float(np.median(np.abs(new - at_nodes)))
         at_nodes = new

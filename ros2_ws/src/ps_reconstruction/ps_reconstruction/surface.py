@@ -85,7 +85,9 @@ def relief(
     """
     light = albedo if albedo.ndim == 2 else albedo.mean(axis=-1)
     lattice = max(1, int(np.sqrt(light.size / 50000)))
-    bright = float(np.nanpercentile(light[::lattice, ::lattice], 95))
+    sample = light[::lattice, ::lattice]
+    sample = sample[np.isfinite(sample)]
+    bright = max(float(np.percentile(sample, 95)), 1e-12) if sample.size else 1.0
     square = np.nan_to_num(light) ** 2
     trust = square / (square + np.float32((DARK_SHARE * bright) ** 2))
     factor = max(1, int(long_px / 4))

@@ -22,7 +22,7 @@ def _smoothstep(edge0: float, edge1: float, x: NDArray) -> NDArray:
 
 
 def machined_disc(x: NDArray, y: NDArray, text: str = '0427', seed: int = 7,
-                  stamp_depth: float = 1.2e-4, albedo: float = 0.55) -> dict[str, Any]:
+                  stamp_depth: float = 1.2e-4, albedo: float = 0.7) -> dict[str, Any]:
     """Turned disc with its face in the plane z = 0, on a table 1.5 mm below.
 
     :param text: the stamped number.
@@ -82,10 +82,10 @@ def _stamp(x: NDArray, y: NDArray, text: str, depth: float, height: float) -> ND
     canvas = np.zeros((260, width_px + 140), np.uint8)
     cv2.putText(canvas, text, (70, 190), cv2.FONT_HERSHEY_SIMPLEX, 120 / 22, 255, 1, cv2.LINE_8)
     distance = cv2.distanceTransform(255 - canvas, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * pixel
-    groove = 0.085 * height
+    groove = 0.07 * height
     profile = depth * (1 - _smoothstep(0.0, groove, distance))
     profile -= 0.12 * depth * np.exp(-((distance - 1.35 * groove) / (0.35 * groove)) ** 2)
-    profile = cv2.GaussianBlur(profile, (0, 0), 3.0).astype(np.float32)
+    profile = cv2.GaussianBlur(profile, (0, 0), 2.0).astype(np.float32)
     column = x / pixel + (canvas.shape[1] - 1) / 2
     row = 130 - y / pixel
     return cv2.remap(profile, column.astype(np.float32), row.astype(np.float32),

@@ -184,7 +184,7 @@ def call(client: Client, request: Any, timeout: float, code: ErrorCode) -> Any:
     :raises PsError: ``code`` if the server is not there or does not answer within ``timeout``
         seconds.
     """
-    if not client.wait_for_service(timeout_sec=min(timeout, 2.0)):
+    if not client.wait_for_service(timeout_sec=min(timeout, 10.0)):
         raise PsError(code, f'service {client.srv_name} is not there; is its node running?')
     response = client.call(request, timeout_sec=timeout)
     if response is None:

@@ -17,15 +17,14 @@ from numpy.typing import NDArray
 
 from ps_head_driver.conversions import message_to_image, message_to_stack
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_head_driver.fake.renderer import truth
-from ps_head_driver.fake.scenes import make_scene
+from ps_head_driver.fake.renderer import make_renderer
 from ps_head_driver.frames import optical_to_plane
 from ps_head_driver.head_model import load_head, nominal_head_path
-from ps_head_driver.stack import Stack, Truth, angular_error_deg
+from ps_head_driver.stack import Geometry, Stack, angular_error_deg
 from ps_inspection.cell_client import CellClient
 from ps_inspection.html_report import data_uri, png_bytes, render_page, shrink
 from ps_inspection.runner import Cell
-from ps_inspection.session_reader import read_info
+from ps_inspection.session_reader import Session
 from ps_interfaces import msg as ps
 from ps_interfaces import srv
 from ps_reconstruction.integration import remove_plane
@@ -98,10 +97,10 @@ def run(options: DemoOptions, progress: Callable[[str], None]) -> DemoResult:
         progress(name)
         return Stopwatch(result.timings_s, name)
 
-    with step('start the cell'):
-        cell = Cell(arguments, log_folder=options.out / 'logs')
-        cell.start()
+    cell = Cell(arguments, log_folder=options.out / 'logs')
     try:
+        with step('start the cell'):
+            cell.start()
         with CellClient(options.namespace, OUTPUTS) as client:
             stack_message, info, images = _inspect(client, options, result, step)
     finally:
@@ -167,7 +166,7 @@ def _inspect(
         'stacks recorded': int(stopped.stacks)}
     result.valid_fraction = info.valid_fraction
     result.residual_rms = info.residual_rms
-    if read_info(Path(session.uri)).stacks != 1:
+    if sum(1 for _ in Session(session.uri).stacks()) != 1:
         result.wrong.append(f'the session {session.uri} does not hold the one stack')
     result.files['session'] = session.uri
     return stack, info, {name: message_to_image(image) for name, image in messages.items()}
@@ -181,7 +180,8 @@ def _write(
 ) -> None:
     stack = message_to_stack(message)
     normal = optical_to_plane(images['normal'])
-    height = height_view(images['height'], _pixel_pitch(stack), stack.images[0])
+    height = height_view(
+        images['height'], _pixel_pitch(stack), metric=stack.geometry is not Geometry.ASSUMED)
     pictures = {
         'shape': images['shape'], 'normal': normal_preview(normal),
         'slope': slope_preview(images['slope']), 'height': height,
@@ -217,7 +217,7 @@ def _measure(
     head = load_head(nominal_head_path())
     if stack.camera is not None:
         head = head.model_copy(update={'camera': stack.camera})
-    true: Truth = truth(make_scene(options.scene), head)
+    true = make_renderer(options.scene, head).truth()
     error = angular_error_deg(normal, true.normal)
     result.error_deg = _statistics(error)
     if true.height is not None:

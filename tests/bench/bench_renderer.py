@@ -1,4 +1,4 @@
-"""Fake camera: time per frame at 1280x1024, first and repeated, and error of the panel sampling."""
+"""Fake camera: time per frame at 1280x1024, first and repeated; error of the panel sampling."""
 import time
 
 import numpy as np
@@ -53,7 +53,7 @@ def _sampling_error() -> Table:
         for tilt in tilts:
             angles, losses = [], []
             for direction in DIRECTIONS:
-                pose = ring.panel_pose(direction, np.radians(tilt))
+                pose = ring.panel_pose(direction, np.radians(tilt))  # type: ignore[arg-type]
                 for point in field:
                     vectors = []
                     for count, gauss in ((MATT, True), (DENSE, False)):

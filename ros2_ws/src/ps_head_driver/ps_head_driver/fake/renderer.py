@@ -23,7 +23,7 @@ from ps_head_driver.stack import Truth
 
 #: Emitters along a panel's width and height: where all of a matt or a glossy point's panel is
 #: visible, and where part of it is.
-MATT, GLOSSY, PARTIAL = (5, 3), (12, 6), (12, 6)
+MATT, GLOSSY, PARTIAL = (5, 3), (12, 6), (10, 5)
 
 _DEEPEST, _BORDER = 0.010, 0.004     # m; a scene reaches this far below the plane, and aside
 
@@ -162,7 +162,7 @@ class Renderer:
             self._points = shading.intersect(
                 scene.height, scene.albedo, *scene.origin, scene.pitch, *scene.height_range,
                 *rays, self.camera.camera_standoff)
-        self._shadow_grids = shading.shadow_grids(scene.height)
+        self._shadow_grids = shading.shadow_grids(scene.height, *scene.origin, scene.pitch)
         self._vignette = self._vignetting()
 
     def _vignetting(self) -> NDArray | None:

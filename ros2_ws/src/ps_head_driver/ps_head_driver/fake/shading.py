@@ -11,10 +11,9 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-BLOCK = 8                      # grid cells along one side of a block of the shadow accelerator
-GROUP = 4                      # blocks along one side of a group of them
+NARROW, WIDE, HUGE = 8, 32, 128     # grid cells along a side of the blocks of the shadow search
 COARSE_AZIMUTHS = 7            # directions across a panel in which shadows are looked for
-FINE_AZIMUTHS = 17             # and where there are some
+FINE_AZIMUTHS = 13             # and where there are some
 _PI = math.pi
 
 # numba's fallback threading layer aborts the process when two threads run parallel kernels
@@ -132,46 +131,63 @@ def intersect(grid, albedo, x0, y0, pitch, low, high, ray_x, ray_y, standoff):  
     return out
 
 
-def _block_tops(values: NDArray, block: int, shared_edges: bool) -> NDArray:
-    """Highest value in each block of cells; with shared edges a block has its far edges too."""
-    ny, nx = (-(-size // block) for size in values.shape)
-    padded = np.pad(values, ((0, ny * block + 1 - values.shape[0]),
-                             (0, nx * block + 1 - values.shape[1])), mode='edge')
-    offsets = (0, 1) if shared_edges else (0,)
-    tall = np.max([padded[j:j + ny * block].reshape(ny, block, -1).max(axis=1)
-                   for j in offsets], axis=0)
-    tops: NDArray = np.max([tall[:, i:i + nx * block].reshape(ny, nx, block).max(axis=2)
-                            for i in offsets], axis=0)
-    return tops
+@nb.njit(cache=True)
+def _roofs(surface, x0, y0, pitch, block):  # type: ignore[no-untyped-def]
+    """Plane over each block of cells that the surface nowhere pierces.
+
+    :returns: (by, bx, 3) float64: a, b, c of a + b x + c y.
+    """
+    last_j, last_i = surface.shape[0] - 1, surface.shape[1] - 1
+    rows, columns = (last_j + block - 1) // block, (last_i + block - 1) // block
+    roofs = np.empty((rows, columns, 3))
+    for row in range(rows):
+        for column in range(columns):
+            j0, i0 = row * block, column * block
+            j1, i1 = min(j0 + block, last_j), min(i0 + block, last_i)
+            # inclined like the block's corners, so that it lies close to a smooth surface
+            low, high = surface[j0, i0], surface[j1, i1]
+            left, right = surface[j1, i0], surface[j0, i1]
+            b = (right - low + high - left) / (2 * pitch * (i1 - i0))
+            c = (left - low + high - right) / (2 * pitch * (j1 - j0))
+            a = -np.inf
+            for j in range(j0, j1 + 1):
+                for i in range(i0, i1 + 1):
+                    a = max(a, surface[j, i] - b * (x0 + i * pitch) - c * (y0 + j * pitch))
+            roofs[row, column, 0], roofs[row, column, 1], roofs[row, column, 2] = a, b, c
+    return roofs
 
 
-def shadow_grids(grid: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+def shadow_grids(grid: NDArray, x0: float, y0: float,
+                 pitch: float) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """What shadows are traced through.
 
     :param grid: (ny, nx) control heights.
-    :returns: surface heights at the grid points, (ny, nx) float32; the highest of them in each
-        block of BLOCK x BLOCK cells; the highest in each group of GROUP x GROUP blocks.
+    :returns: surface heights at the grid points, (ny, nx) float32, and the roofs over blocks of
+        NARROW, WIDE and HUGE cells.
     """
     padded = np.pad(grid, 1, mode='edge')
     rows = (padded[:-2] + 4 * padded[1:-1] + padded[2:]) / 6
     surface = ((rows[:, :-2] + 4 * rows[:, 1:-1] + rows[:, 2:]) / 6).astype(np.float32)
-    tops = _block_tops(surface, BLOCK, shared_edges=True)
-    return surface, tops, _block_tops(tops, GROUP, shared_edges=False)
+    return surface, *(_roofs(surface, x0, y0, pitch, block) for block in (NARROW, WIDE, HUGE))
 
 
 @nb.njit(cache=True, inline='always')
-def _leave(t, x, y, i, j, dx, dy, inverse_x, inverse_y, x0, y0, side):  # type: ignore[no-untyped-def]
-    """Where the line (x, y) + t (dx, dy) leaves block (i, j)."""
+def _clear_until(roofs, t, x, y, z, i, j, dx, dy, tangent, inverse_x, inverse_y, x0, y0, side):  # type: ignore[no-untyped-def]
+    """Where the line leaves block (i, j), and whether it stays above the block's roof."""
     edge_x = x0 + (i + (1 if dx > 0.0 else 0)) * side
     edge_y = y0 + (j + (1 if dy > 0.0 else 0)) * side
-    return max(t, min((edge_x - x) * inverse_x, (edge_y - y) * inverse_y))
+    leave = max(t, min((edge_x - x) * inverse_x, (edge_y - y) * inverse_y))
+    a, b, c = roofs[j, i, 0], roofs[j, i, 1], roofs[j, i, 2]
+    start = z - a - b * x - c * y
+    slope = tangent - b * dx - c * dy
+    return leave, min(start + t * slope, start + leave * slope) > 0.0
 
 
 @nb.njit(cache=True, fastmath=True)
-def _horizon(surface, tops, wide_tops, top, x0, y0, pitch, x, y, z, dx, dy, lowest, highest):  # type: ignore[no-untyped-def]
+def _horizon(surface, narrow, wide, huge, top, x0, y0, pitch, x, y, z, dx, dy, lowest, highest):  # type: ignore[no-untyped-def]
     """Tangent of the elevation below which the surface hides the sky, seen from (x, y, z).
 
-    :param tops: highest point of each block, m; wide_tops of each group of blocks.
+    :param narrow: roofs of the small blocks; wide and huge those of the larger ones.
     :param top: highest point of all, m.
     :param dx: horizontal unit direction, with dy.
     :param lowest: lower tangents are of no interest and are returned as this.
@@ -182,26 +198,28 @@ def _horizon(surface, tops, wide_tops, top, x0, y0, pitch, x, y, z, dx, dy, lowe
     # the facet that the point lies on is the business of n.l: leave it out
     t = 1.5 * step
     past = 0.01 * pitch
-    side, wide = BLOCK * pitch, GROUP * BLOCK * pitch
+    side = NARROW * pitch
     per_side, per_pitch = 1.0 / side, 1.0 / pitch
     inverse_x = 1.0 / dx if abs(dx) > 1e-9 else 1e9
     inverse_y = 1.0 / dy if abs(dy) > 1e-9 else 1e9
     columns, rows = surface.shape[1] - 1.001, surface.shape[0] - 1.001
     while True:
-        z_line = z + t * tangent
-        if tangent >= highest or (z_line > top and tangent >= 0.0):
+        if tangent >= highest or (z + t * tangent > top and tangent >= 0.0):
             return tangent
         u, v = (x + t * dx - x0) * per_side, (y + t * dy - y0) * per_side
-        if u < 0.0 or v < 0.0 or u >= tops.shape[1] or v >= tops.shape[0]:
+        if u < 0.0 or v < 0.0 or u >= narrow.shape[1] or v >= narrow.shape[0]:
             return tangent
         i, j = int(u), int(v)
-        wide_i, wide_j = i // GROUP, j // GROUP
-        leave = _leave(t, x, y, wide_i, wide_j, dx, dy, inverse_x, inverse_y, x0, y0, wide)
-        if min(z_line, z + leave * tangent) > wide_tops[wide_j, wide_i]:
-            t = leave + past
-            continue
-        leave = _leave(t, x, y, i, j, dx, dy, inverse_x, inverse_y, x0, y0, side)
-        if min(z_line, z + leave * tangent) > tops[j, i]:
+        leave, clear = _clear_until(huge, t, x, y, z, i // (HUGE // NARROW), j // (HUGE // NARROW),
+                                    dx, dy, tangent, inverse_x, inverse_y, x0, y0, HUGE * pitch)
+        if not clear:
+            leave, clear = _clear_until(
+                wide, t, x, y, z, i // (WIDE // NARROW), j // (WIDE // NARROW), dx, dy, tangent,
+                inverse_x, inverse_y, x0, y0, WIDE * pitch)
+        if not clear:
+            leave, clear = _clear_until(narrow, t, x, y, z, i, j, dx, dy, tangent, inverse_x,
+                                        inverse_y, x0, y0, side)
+        if clear:
             t = leave + past
             continue
         leave += past
@@ -293,7 +311,7 @@ def _sum_emitters(emitters, panel, x, y, z, nx, ny, nz, vx, vy, vz, diffuse, spe
 
 @nb.njit(cache=True, parallel=True, fastmath=True)
 def shade(points, specular, alpha, coarse, coarse_panel, fine, fine_panel, corners, intensity,  # type: ignore[no-untyped-def]
-          surface, tops, wide_tops, top, x0, y0, pitch, standoff):
+          surface, narrow, wide, huge, top, x0, y0, pitch, standoff):
     """Radiance towards the camera of every visible point under one panel.
 
     Where the whole panel is above the point's own facet and above the horizon, the coarse
@@ -344,7 +362,7 @@ def shade(points, specular, alpha, coarse, coarse_panel, fine, fine_panel, corne
             dx = coarse_panel[5, 0] + along * coarse_panel[4, 0]
             dy = coarse_panel[5, 1] + along * coarse_panel[4, 1]
             length = math.sqrt(dx * dx + dy * dy)
-            horizon = _horizon(surface, tops, wide_tops, top, x0, y0, pitch, x, y, z,
+            horizon = _horizon(surface, narrow, wide, huge, top, x0, y0, pitch, x, y, z,
                                dx / length, dy / length, lowest, highest)
             whole, dark = whole and horizon <= lowest, dark and horizon >= highest
             if not whole and not dark:
@@ -364,7 +382,7 @@ def shade(points, specular, alpha, coarse, coarse_panel, fine, fine_panel, corne
             dx = coarse_panel[5, 0] + along * coarse_panel[4, 0]
             dy = coarse_panel[5, 1] + along * coarse_panel[4, 1]
             length = math.sqrt(dx * dx + dy * dy)
-            horizons[a] = _horizon(surface, tops, wide_tops, top, x0, y0, pitch, x, y, z,
+            horizons[a] = _horizon(surface, narrow, wide, huge, top, x0, y0, pitch, x, y, z,
                                    dx / length, dy / length, lowest, highest)
         out[k] = intensity * _sum_emitters(
             fine, fine_panel, x, y, z, nx, ny, nz, vx, vy, vz, diffuse, specular, alpha,

@@ -131,30 +131,30 @@ def read_stack(path: str | Path, slant: float = DEFAULT_SLANT,
     if not folder.is_dir():
         raise PsError(_BAD, f'{folder}: no such folder')
     if (folder / 'lights.yaml').is_file():
-        stack = _read_near(folder)
+        stack, stems = _read_near(folder)
     elif (folder / 'filenames.txt').is_file():
-        stack = _read_distant(folder)
+        stack, stems = _read_distant(folder)
     else:
         return _read_four(folder, slant, flat), None
     if (folder / 'mask.png').is_file():
-        mask = _read_image(folder / 'mask.png')
-        mask = mask.any(axis=2) if mask.ndim == 3 else mask > 0
+        picture = _read_image(folder / 'mask.png')
+        mask = np.any(picture > 0, axis=2) if picture.ndim == 3 else picture > 0
         if mask.shape != stack.shape:
             raise PsError(_BAD, f'{folder / "mask.png"}: is {mask.shape[::-1]} pixels, the '
                                 f'pictures are {stack.shape[::-1]}')
         stack = replace(stack, mask=mask)
     flats = Path(flat) if flat else folder / 'flat'
     if flats.is_dir() or flat:
-        names = [light.name for light in stack.lights]
-        stack = replace(stack, gain_maps=_read_flats([_flat_file(flats, n) for n in names]),
+        stack = replace(stack, gain_maps=_read_flats([_flat_file(flats, s) for s in stems]),
                         flat_id=stack.flat_id or 'folder')
     return stack, _read_truth(folder, stack.shape)
 
 
-def _read_near(folder: Path) -> Stack:
+def _read_near(folder: Path) -> tuple[Stack, list[str]]:
     lights = read_lights(folder)
     images: list[NDArray] = []
     states: list[Light] = []
+    stems: list[str] = []
     ambient = None
     for i, frame in enumerate(lights.frames):
         image = _read_image(_inside(folder, frame.file, f'lights.yaml: frames.{i}.file'))
@@ -163,8 +163,9 @@ def _read_near(folder: Path) -> Stack:
             ambient = image
             continue
         images.append(image)
+        stems.append(Path(frame.file).stem)
         states.append(Light(
-            name=Path(frame.file).stem, panel=Panel[frame.panel], mode=Mode[frame.mode],
+            name=frame.name or stems[-1], panel=Panel[frame.panel], mode=Mode[frame.mode],
             position=frame.position or (0.0, 0.0, 0.0), axis=_unit(frame.axis or (0, 0, -1.0)),
             right=_unit(frame.right), size=frame.size, lobe_exponent=frame.lobe_exponent,
             intensity=frame.intensity, exposure_scale=frame.exposure_scale, distant=frame.distant,
@@ -173,11 +174,11 @@ def _read_near(folder: Path) -> Stack:
         raise PsError(_BAD, f'{folder / "lights.yaml"}: frames: no lit frame')
     if ambient is None and (folder / 'ambient.png').is_file():
         ambient = _read_image(folder / 'ambient.png')
-    _check_alike(folder, images, [state.name for state in states], ambient)
+    _check_alike(folder, images, stems, ambient)
     height, width = images[0].shape[:2]
-    camera = lights.camera and CameraGeometry(
-        width_px=width, height_px=height, **lights.camera.model_dump())
-    return Stack(
+    camera = CameraGeometry(width_px=width, height_px=height, **lights.camera.model_dump()) if (
+        lights.camera) else None
+    stack = Stack(
         images=images, lights=states, camera=camera, ambient=ambient,
         plane=Plane(_unit(lights.plane.normal), lights.plane.offset),
         geometry=Geometry[lights.geometry], stack_id=lights.stack_id,
@@ -185,9 +186,10 @@ def _read_near(folder: Path) -> Stack:
         calibration_id=lights.calibration_id, flat_id=lights.flat_id,
         convergence_radius=_or_nan(lights.convergence_radius),
         light_height=_or_nan(lights.light_height))
+    return stack, stems
 
 
-def _read_distant(folder: Path) -> Stack:
+def _read_distant(folder: Path) -> tuple[Stack, list[str]]:
     names = (folder / 'filenames.txt').read_text(encoding='utf-8').split('\n')
     names = [name.strip() for name in names if name.strip()]
     if not names:
@@ -215,7 +217,8 @@ def _read_distant(folder: Path) -> Stack:
         Light(name=Path(name).stem, distant=True, axis=_vector(-direction),
               intensity=float(own[0]) if len(own) == 1 else _vector(own))
         for name, direction, own in zip(names, directions, intensities, strict=True)]
-    return Stack(images=images, lights=lights, ambient=ambient, geometry=Geometry.CALIBRATED)
+    stack = Stack(images=images, lights=lights, ambient=ambient, geometry=Geometry.CALIBRATED)
+    return stack, [light.name for light in lights]
 
 
 def _read_four(folder: Path, slant: float, flat: str | Path | None) -> Stack:
@@ -264,13 +267,14 @@ def _four_files(folder: Path, of_flat: bool) -> dict[str, Path] | None:
 
 def _read_flats(files: Sequence[Path]) -> list[NDArray]:
     """Flat-field pictures as gain maps, relative to their common maximum."""
-    gains = []
+    gains: list[NDArray] = []
     for file in files:
         image = np.asarray(_read_image(file), np.float32)
         image = image.mean(axis=2) if image.ndim == 3 else image
         if image.shape[0] > FLAT_ROWS:
             width = max(1, round(image.shape[1] * FLAT_ROWS / image.shape[0]))
-            image = cv2.resize(image, (width, FLAT_ROWS), interpolation=cv2.INTER_AREA)
+            image = np.asarray(
+                cv2.resize(image, (width, FLAT_ROWS), interpolation=cv2.INTER_AREA), np.float32)
         if not image.max() > 0:
             raise PsError(_BAD, f'{file}: the flat-field picture is black')
         gains.append(image)
@@ -291,7 +295,7 @@ def _read_truth(folder: Path, shape: tuple[int, int]) -> Truth | None:
     if file.is_file():
         try:
             normal = np.asarray(scipy.io.loadmat(file)['Normal_gt'], np.float32)
-        except (KeyError, ValueError, NotImplementedError, OSError) as error:
+        except Exception as error:      # scipy answers a foreign file with errors of any type
             raise PsError(_BAD, f'{file}: key Normal_gt cannot be read: {error}') from error
         if normal.shape != (*shape, 3):
             raise PsError(_BAD, f'{file}: Normal_gt is {normal.shape}, not {(*shape, 3)}')

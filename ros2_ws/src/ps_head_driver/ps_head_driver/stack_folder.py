@@ -118,12 +118,13 @@ def read_lights(folder: str | Path) -> LightsFile:
 
 # ---------------------------------------------------------------------------- reading
 
-def read_stack(path: str | Path, slant: float = DEFAULT_SLANT,
-               flat: str | Path | None = None) -> tuple[Stack, Truth | None]:
+def read_stack(path: str | Path, slant: float = DEFAULT_SLANT, flat: str | Path | None = None,
+               lights: str = 'all') -> tuple[Stack, Truth | None]:
     """Read a stack folder, a benchmark folder or four plain pictures.
 
     :param slant: angle of the light to the optical axis for four plain pictures, rad.
     :param flat: folder with the flat-field pictures, instead of the folder's own.
+    :param lights: which frames, see :func:`select_lights`.
     :returns: the stack, and the ground truth where the folder has it.
     :raises PsError: RECONSTRUCTION_BAD_STACK naming file and field.
     """
@@ -135,7 +136,7 @@ def read_stack(path: str | Path, slant: float = DEFAULT_SLANT,
     elif (folder / 'filenames.txt').is_file():
         stack, stems = _read_distant(folder)
     else:
-        return _read_four(folder, slant, flat), None
+        return select_lights(_read_four(folder, slant, flat), lights, folder), None
     if (folder / 'mask.png').is_file():
         picture = _read_image(folder / 'mask.png')
         mask = np.any(picture > 0, axis=2) if picture.ndim == 3 else picture > 0
@@ -147,7 +148,7 @@ def read_stack(path: str | Path, slant: float = DEFAULT_SLANT,
     if flats.is_dir() or flat:
         stack = replace(stack, gain_maps=_read_flats([_flat_file(flats, s) for s in stems]),
                         flat_id=stack.flat_id or 'folder')
-    return stack, _read_truth(folder, stack.shape)
+    return select_lights(stack, lights, folder), _read_truth(folder, stack.shape)
 
 
 def _read_near(folder: Path) -> tuple[Stack, list[str]]:

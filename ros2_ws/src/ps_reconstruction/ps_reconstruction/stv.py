@@ -1,0 +1,292 @@
+"""Robust photometric stereo (paper, §2.4, Eq. 5-7), compiled and on all cores.
+
+For every pixel p
+
+    min over g   sum_{q in N(p)} sum_t w_patch(p, q) w_temp(q, t) huber(v_t(q) - f_t(q) s_t(q) . g)
+                 + lambda |g - g_LS(p)|^2
+
+v intensity, s light vector, w_patch spatial Gaussian times edge-aware weight, w_temp in {0, 1}.
+f_t = f(n.l, n.h) / (n.l) is the object's own departure from Lambert's law (reflectance.py), 1 for
+a matt surface: it makes s_t effective, as the paper has it.
+
+Two stages. `plan` looks at some thousand pixels spread over the image: it fits the reflectance
+and chooses how far to trust it (`Trust`). Then bands of rows are solved independently. Temporal
+and Huber weights belong to a pixel q and are shared by all patches that contain it, so a patch
+is a weighted sum of normal equations that exist already. `stv_oracle.solve` is the unshared
+definition in plain NumPy.
+"""
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ps_head_driver.errors import ErrorCode, PsError
+from ps_reconstruction import reflectance
+from ps_reconstruction.bands import for_bands
+from ps_reconstruction.least_squares import check_lights, empty_solution
+from ps_reconstruction.outliers import HUBER, LEAST_COSINE, LEAST_RATIO, MANY, MOST_RATIO
+from ps_reconstruction.problem import GREY_WEIGHTS, Problem, Solution
+from ps_reconstruction.stv_kernels import combine_patches, estimate_samples, finish, solve_pixels
+
+BAND = 16                     # rows per band
+SAMPLES = 4000                # pixels that the plan looks at
+ROUNDS = 5                    # of the reflectance fit
+NOT_LAMBERTIAN = 0.1          # median relative residual of LS from which few lights tell nothing
+
+
+class Trust(IntEnum):
+    """How far a stack departs from least squares; each rests on the one before."""
+
+    LEAST_SQUARES = 0         # the robust estimates predict the frames worse: keep LS
+    REJECTION = 1             # reject shadows and highlights, Lambert's law for the rest
+    REFLECTANCE = 2           # also the object's own reflectance
+
+
+@dataclass(frozen=True)
+class StvOptions:
+    """Parameters of the robust regression; the defaults suit metal, plastic and ceramic parts.
+
+    :param patch: width of the square patch N(p) in pixels, odd; 1 for none.
+    :param spatial_sigma: of the spatial Gaussian, in pixels.
+    :param edge_sigma: relative difference of the scaled normals that halves the edge-aware weight.
+    :param ridge: lambda, relative to the information of the equations.
+    :param rounds: repetitions of rejection and solution per pixel.
+    :param trust: fixed choice instead of the one made from the data.
+    """
+
+    patch: int = 5
+    spatial_sigma: float = 1.0
+    edge_sigma: float = 0.05
+    ridge: float = 1e-3
+    rounds: int = 2
+    trust: Trust | None = None
+
+    def __post_init__(self) -> None:
+        if self.patch % 2 == 0 or not 1 <= self.patch <= 15:
+            raise PsError(ErrorCode.RECONSTRUCTION_BAD_PARAMETER,
+                          f'patch: {self.patch} must be odd, 1 to 15')
+        for name in ('spatial_sigma', 'edge_sigma'):
+            if not getattr(self, name) > 0:
+                raise PsError(ErrorCode.RECONSTRUCTION_BAD_PARAMETER, f'{name}: must be positive')
+        if not self.ridge >= 0 or not 1 <= self.rounds <= 50:
+            raise PsError(ErrorCode.RECONSTRUCTION_BAD_PARAMETER,
+                          'ridge must not be negative, rounds must be 1 to 50')
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What holds for the whole stack: the reflectance and how far to trust it."""
+
+    coefficients: NDArray[np.float64]
+    trust: Trust
+
+    @property
+    def table(self) -> NDArray[np.float32]:
+        """Of reflectance.tabulate; Lambert's law unless the reflectance is trusted."""
+        trusted = self.trust == Trust.REFLECTANCE
+        table: NDArray[np.float32] = reflectance.tabulate(
+            self.coefficients if trusted else np.zeros(reflectance.TERMS))
+        return table
+
+
+def solve(problem: Problem, options: StvOptions | None = None, quality: bool = True,
+          out: Solution | None = None) -> Solution:
+    """Normals and albedo by robust regression.
+
+    :param quality: also compute confidence, reason and residual_rms.
+    :param out: arrays to fill instead of new ones; must fit the problem.
+    :raises PsError: RECONSTRUCTION_TOO_FEW_LIGHTS, RECONSTRUCTION_DEGENERATE_LIGHTS,
+        RECONSTRUCTION_BAD_PARAMETER.
+    """
+    options = options or StvOptions()
+    check_lights(problem.lights)
+    result = out if out is not None else empty_solution(problem, quality)
+    height, width = problem.shape
+    decided = plan(problem, options)
+    table, trust = decided.table, int(decided.trust)
+    lights = problem.lights.astype(np.float32)
+    view = _view(problem).astype(np.float32)
+    flat = (np.zeros((0, 0, 0), np.float32) if problem.reciprocal_flat is None
+            else problem.reciprocal_flat.astype(np.float32))
+    spatial = _spatial(options)
+    radius = options.patch // 2
+
+    def work(first: int, last: int) -> tuple[float, float, int]:
+        top, bottom = max(first - radius, 0), min(last + radius, height)
+        shape = (bottom - top, width)
+        channels, grey, saturated = _band_values(problem, top, bottom)
+        mask = np.ones(shape, np.bool_) if problem.mask is None else problem.mask[top:bottom]
+        reference, scaled = np.zeros((2, 3, *shape), np.float32)
+        equations = np.zeros((9, *shape), np.float32)
+        shading = np.zeros((problem.count if problem.colour else 0, *shape), np.float32)
+        tally = np.zeros((4, *shape), np.float32)
+        reason = np.zeros(shape, np.uint8)
+        solve_pixels(grey, saturated, mask, lights, view, flat, problem.step, top, table,
+                     options.rounds, trust, reference, scaled, equations, shading, tally, reason)
+        inner = slice(first - top, last - top)
+        if trust == Trust.LEAST_SQUARES:
+            solved = reference[:, inner]
+        else:
+            solved = np.empty((3, last - first, width), np.float32)
+            combine_patches(reference, scaled, equations, spatial, options.edge_sigma,
+                            options.ridge, first - top, solved)
+        length = np.empty((last - first, width), np.float32)
+        confidence = np.empty((last - first, width), np.uint8)
+        sums: tuple[float, float, int] = finish(
+            solved, tally[:, inner], mask[inner], problem.count, result.normal[first:last],
+            length, confidence, reason[inner])
+        if problem.colour:
+            colour = np.einsum('thw,thwc->hwc', shading[:, inner], channels[:, inner])
+            colour[np.isnan(length)] = np.nan
+            result.albedo[first:last] = colour
+        else:
+            result.albedo[first:last] = length
+        if quality:
+            assert result.confidence is not None and result.reason is not None
+            result.confidence[first:last] = confidence
+            result.reason[first:last] = reason[inner]
+        return sums
+
+    squares, brightness, count = np.sum(for_bands(height, BAND, work), axis=0)
+    if quality and problem.count > 3 and count and brightness > 0:
+        result.residual_rms = float(np.sqrt(squares / count) / (brightness / count))
+    return result
+
+
+def plan(problem: Problem, options: StvOptions | None = None) -> Plan:
+    """Fit the object's reflectance to sample pixels and choose how far to trust it.
+
+    The choice compares how well each estimate predicts all frames of the samples, the rejected
+    ones included: mean of |difference| / mean intensity of the pixel, each at most 1.
+    """
+    options = options or StvOptions()
+    lambertian = Plan(np.zeros(reflectance.TERMS), Trust.REJECTION)
+    u, d, h, usable, g_ls = _samples(problem)
+    if problem.count == 3 or len(u) == 0:
+        return Plan(lambertian.coefficients, Trust.LEAST_SQUARES)
+    g_first = g_ls.copy()
+    estimate_samples(u, d, h, usable, lambertian.table, 0, int(Trust.REJECTION), g_first)
+    coefficients, g = lambertian.coefficients, g_first.copy()
+    exact = [a.astype(np.float64) for a in (u, d, h)]
+    for _ in range(ROUNDS):
+        coefficients = reflectance.improved(coefficients, *reflectance.normal_equations(
+            *exact, usable, g.astype(np.float64), coefficients, LEAST_COSINE, LEAST_RATIO,
+            MOST_RATIO, HUBER))
+        fitted = Plan(coefficients, Trust.REFLECTANCE)
+        g = g_ls.copy()
+        estimate_samples(u, d, h, usable, fitted.table, options.rounds, int(fitted.trust), g)
+    if options.trust is not None:
+        return Plan(coefficients, options.trust)
+    residual_ls = _misfit(u, d, h, g_ls, lambertian)
+    residual_first = _misfit(u, d, h, g_first, lambertian)
+    residual_fitted = _misfit(u, d, h, g, fitted)
+    if problem.count >= MANY:
+        trusted = residual_fitted.mean() <= residual_first.mean()
+        return Plan(coefficients, Trust.REFLECTANCE if trusted else Trust.REJECTION)
+    if np.median(residual_ls) > NOT_LAMBERTIAN:
+        return Plan(coefficients, Trust.LEAST_SQUARES)
+    if residual_fitted.mean() <= residual_ls.mean():
+        return Plan(coefficients, Trust.REFLECTANCE)
+    better = residual_first.mean() <= residual_ls.mean()
+    return Plan(coefficients, Trust.REJECTION if better else Trust.LEAST_SQUARES)
+
+
+def _misfit(u: NDArray, d: NDArray, h: NDArray, g: NDArray, plan: Plan) -> NDArray:
+    """Relative differences between samples and prediction, (P, T), at most 1."""
+    length = np.maximum(np.linalg.norm(g, axis=1, keepdims=True), 1e-12)
+    cosine = np.clip(np.einsum('pi,pti->pt', g, d) / length, 0, 1)
+    half = np.clip(np.einsum('pi,pti->pt', g, h) / length, reflectance.LEAST_HALF, 1)
+    predicted = length * cosine * reflectance.look_up_all(plan.table, cosine, half)
+    level = np.maximum(np.mean(u, axis=1, keepdims=True), 1e-12)
+    return np.minimum(np.abs(u - predicted) / level, 1)
+
+
+def _samples(problem: Problem) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
+    """At most about SAMPLES pixels spread over the mask.
+
+    :returns: u (P, T), d (P, T, 3), h (P, T, 3), usable (P, T), g_ls (P, 3), float32.
+    """
+    height, width = problem.shape
+    if problem.mask is None:
+        # an odd stride off the width walks through all columns
+        stride = max(1, height * width // SAMPLES) | 1
+        index = np.arange(0, height * width, stride + 2 * (width % stride == 0))
+    else:
+        index = np.flatnonzero(problem.mask)
+        index = index[::max(1, len(index) // SAMPLES)]
+    row, column = np.divmod(index, width)
+    nodes = (row / problem.step, column / problem.step)
+    lights = _interpolate(problem.lights, *nodes)
+    view = _interpolate(_view(problem), *nodes)
+    weights = np.array(GREY_WEIGHTS) if problem.colour else np.ones(1)
+    values, usable = np.empty(lights.shape[:2]), np.ones(lights.shape[:2], np.bool_)
+    dark = (0.0 if problem.ambient is None
+            else problem.ambient[row, column].reshape(len(row), -1).astype(np.float64))
+    for t, (frame, scale) in enumerate(zip(problem.frames, problem.scale, strict=True)):
+        raw = frame[row, column].reshape(len(row), -1).astype(np.float64)
+        usable[:, t] = raw.max(axis=1) < problem.saturation
+        values[:, t] = np.minimum((raw - dark) * scale, problem.clip) @ weights
+    if problem.reciprocal_flat is not None:
+        values *= _interpolate(problem.reciprocal_flat, *nodes)
+    lit = values.mean(axis=1) > 0
+    values, lights, view, usable = values[lit], lights[lit], view[lit], usable[lit]
+    g_ls = np.einsum('pit,pt->pi', np.linalg.pinv(lights), values)
+    irradiance = np.linalg.norm(lights, axis=2)
+    d = lights / irradiance[..., None]
+    h = d + view[:, None]
+    h /= np.linalg.norm(h, axis=2, keepdims=True)
+    single = [np.ascontiguousarray(a, np.float32) for a in (values / irradiance, d, h, g_ls)]
+    return single[0], single[1], single[2], usable, single[3]
+
+
+def _interpolate(grid: NDArray, row: NDArray, column: NDArray) -> NDArray:
+    """Bilinear interpolation of nodes at P positions given in nodes, (gh, gw, ...) to (P, ...)."""
+    i = np.minimum(row.astype(int), grid.shape[0] - 2)
+    j = np.minimum(column.astype(int), grid.shape[1] - 2)
+    fy, fx = (f.reshape(-1, *(1,) * (grid.ndim - 2)) for f in (row - i, column - j))
+    result: NDArray = ((1 - fy) * ((1 - fx) * grid[i, j] + fx * grid[i, j + 1])
+                       + fy * ((1 - fx) * grid[i + 1, j] + fx * grid[i + 1, j + 1]))
+    return result
+
+
+def _view(problem: Problem) -> NDArray[np.float64]:
+    """Directions to the camera at the nodes; from straight above where unknown."""
+    if problem.view is not None:
+        return problem.view
+    view = np.zeros((*problem.lights.shape[:2], 3))
+    view[..., 2] = 1
+    return view
+
+
+def _spatial(options: StvOptions) -> NDArray[np.float32]:
+    """Spatial weights of a patch, 1 at its centre."""
+    offset = np.arange(options.patch) - options.patch // 2
+    square = offset[:, None] ** 2 + offset[None] ** 2
+    weights: NDArray[np.float32] = np.exp(-0.5 * square / options.spatial_sigma ** 2
+                                          ).astype(np.float32)
+    return weights
+
+
+def _band_values(problem: Problem, top: int, bottom: int) -> tuple[NDArray, NDArray, NDArray]:
+    """Normalised intensities of rows ``top`` to ``bottom``, before the flat field.
+
+    :returns: channels (T, h, W, C) and grey (T, h, W), float32; saturated (T, h, W) or of size 0.
+    """
+    shape = (bottom - top, problem.shape[1], 3 if problem.colour else 1)
+    channels = np.empty((problem.count, *shape), np.float32)
+    limited = np.isfinite(problem.saturation)
+    saturated = np.zeros((problem.count if limited else 0, *shape[:2]), np.bool_)
+    dark = None if problem.ambient is None else problem.ambient[top:bottom].reshape(shape)
+    for t, (frame, scale) in enumerate(zip(problem.frames, problem.scale, strict=True)):
+        raw = frame[top:bottom].reshape(shape)
+        if limited:
+            saturated[t] = (raw >= problem.saturation).any(axis=-1)
+        channels[t] = raw
+        if dark is not None:
+            channels[t] -= dark
+        channels[t] *= scale.astype(np.float32)
+    if np.isfinite(problem.clip):
+        np.minimum(channels, np.float32(problem.clip), out=channels)
+    grey = channels @ np.array(GREY_WEIGHTS, np.float32) if problem.colour else channels[..., 0]
+    return channels, np.ascontiguousarray(grey), saturated

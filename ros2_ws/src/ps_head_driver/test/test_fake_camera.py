@@ -8,9 +8,14 @@ import pytest
 
 from ps_head_driver.cameras.fake import FakeCamera, FrameFaults
 from ps_head_driver.errors import ErrorCode, PsError
+from ps_head_driver.fake.bench import fake_head
 from ps_head_driver.fake.renderer import Sensor, make_renderer
 from ps_head_driver.fake.trigger_socket import StrobeEvent, TriggerServer
+from ps_head_driver.head_client import HeadClient, Motion
 from ps_head_driver.head_model import load_head, nominal_head_path
+from ps_head_driver.kinematics import BrightFieldKinematics
+from ps_head_driver.protocol import FULL_LEVEL, Step
+from ps_head_driver.serial_link import SerialLink
 
 HEAD = load_head(nominal_head_path())
 TILT, DF_TILT, PERIOD_NS = 0.5, 1.3, 20_000_000
@@ -22,7 +27,7 @@ class Board:
 
     def __init__(self, path: Path) -> None:
         self.server = TriggerServer(path)
-        self.count = 0
+        self.count, self.triggers, self.boot = 0, 100, 0
         self._lock, self._end = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
@@ -32,12 +37,14 @@ class Board:
             with self._lock:
                 self.server.service()
 
-    def strobe(self, levels=(1, 0, 0, 0), tilt=TILT, strobe_s=0.004, period_ns=PERIOD_NS):
+    def strobe(self, levels=(1, 0, 0, 0), tilt=TILT, strobe_s=0.004, trigger=True):
         self.count += 1
+        self.triggers += trigger
         with self._lock:
             self.server.strobe(StrobeEvent(
-                self.count, self.count + 100, self.count * period_ns, strobe_s,
-                tuple(float(level) for level in levels), (0.0,) * 4, 1000.0, tilt, DF_TILT))
+                self.count, self.triggers, self.count * PERIOD_NS, strobe_s,
+                tuple(float(level) for level in levels), (0.0,) * 4, 1000.0, tilt, DF_TILT,
+                self.boot))
 
     def close(self) -> None:
         self._end.set()
@@ -146,6 +153,44 @@ def test_triggers_that_come_too_fast_are_missed(board, tmp_path):
         frames = camera.collect(4, 0.3)
     assert [frame.trigger_counter - 100 for frame in frames] == [1, 3]
     assert frames[1].frame_counter == frames[0].frame_counter + 1
+
+
+def test_a_strobe_without_trigger_makes_no_picture(camera, board):
+    camera.arm([0.004] * 2)
+    board.strobe()
+    board.strobe(trigger=False)
+    board.strobe()
+    board.boot, board.triggers = 1, 0       # the board restarts
+    board.strobe(trigger=False)
+    frames = camera.collect(3, 0.3)
+    assert [frame.trigger_counter for frame in frames] == [101, 102]
+
+
+def test_with_the_emulator_it_shows_where_the_motor_really_is(tmp_path):
+    motion = Motion(settle_s=0.0)
+    ring = [Step(1 << i, FULL_LEVEL, 2000, 4000, 17000) for i in range(8)]
+    with fake_head(tmp_path) as (ports, control):
+        client = HeadClient([SerialLink(port) for port in ports], (0, 64000))
+        client.connect(motion)
+        client.home()
+        client.move_to(24000, Motion(approach_up=False, settle_s=0.0))      # off by the backlash
+        slider = control.command('state')['slider_counts']
+        df_tilt = client.set_df_tilt(1.25).df_tilt
+        with FakeCamera(HEAD, 'plate', tmp_path / 'trigger.sock', scale=0.05,
+                        noise=False) as camera:
+            camera.arm([0.004] * 8)
+            records = client.run_program(ring).records
+            frames = camera.collect(8, 5.0)
+            own = camera.renderer
+        client.disconnect()
+    assert slider != pytest.approx(24000, abs=50)
+    tilt = float(BrightFieldKinematics(HEAD).tilt(slider))
+    for i, (frame, record) in enumerate(zip(frames, records, strict=True)):
+        assert frame.trigger_counter == record.trigger_counter
+        assert frame.device_time_ns == record.time_us * 1000
+        levels = np.eye(8)[i]
+        expected = own.render(tilt, df_tilt, levels[:4], levels[4:])
+        assert np.abs(frame.image.astype(int) - expected).max() <= 1
 
 
 def test_cancel_ends_collect_early(camera):

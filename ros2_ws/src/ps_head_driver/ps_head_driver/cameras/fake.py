@@ -77,6 +77,7 @@ class FakeCamera(Camera):
         self._armings = self._exposed = 0
         self._first: tuple[int, int] | None = None      # device and host time of the first frame
         self._last_device_ns: int | None = None
+        self._last_trigger: tuple[int, int] | None = None
         self._progress_s = 0.0
 
     @property
@@ -189,7 +190,10 @@ class FakeCamera(Camera):
 
     def _expose(self, event: StrobeEvent) -> tuple[int, int, float, float, int] | None:
         """Take the trigger: index since arming, frame counter, exposure, gain, host time."""
-        if not self._armed:
+        trigger = (event.boot, event.trigger_counter)
+        triggered = event.trigger_counter > 0 and trigger != self._last_trigger
+        self._last_trigger = trigger
+        if not (self._armed and triggered):
             return None
         last = self._last_device_ns
         if last is not None and 0 <= event.device_time_ns - last < self._shortest_ns:

@@ -99,23 +99,32 @@ def divergence(du: NDArray[np.float32], dv: NDArray[np.float32]) -> NDArray[np.f
     return out
 
 
-def solve_poisson(right: NDArray[np.float32], response: NDArray | None = None
-                  ) -> NDArray[np.float32]:
-    """Solve the five-point Laplace equation with Neumann borders.
+def solve_poisson(right: NDArray[np.float32], short_px: float = 0.0, long_px: float = 0.0,
+                  pole_px: float = 0.0) -> NDArray[np.float32]:
+    """Solve the five-point Laplace equation with Neumann borders, filtered on the way.
 
     :param right: (H, W) float32; overwritten.
-    :param response: (H, W) factors on the cosine spectrum (a filter), or None.
+    :param short_px: sigma of a Gaussian low-pass; 0 for none.
+    :param long_px: sigma of a Gaussian high-pass; 0 for none.
+    :param pole_px: length of a one-pole high-pass (screened Poisson); 0 for none.
     """
     workers = core_count()
     spectrum = scipy.fft.dctn(right, type=2, overwrite_x=True, workers=workers)
-    column, row = (laplace_eigenvalues(n).astype(np.float32) for n in spectrum.shape)
+    column, row = (laplace_eigenvalues(n) for n in spectrum.shape)
+    # exp of the sum of eigenvalues is the product of two vectors
+    short, long = ([np.exp(0.5 * sigma ** 2 * values).astype(np.float32)
+                    for values in (column, row)] for sigma in (short_px, long_px))
+    if long_px <= 0:
+        long = [np.zeros_like(values) for values in long]
+    pole = np.float32(1 / pole_px ** 2 if pole_px > 0 else 0)
+    column, row = column.astype(np.float32), row.astype(np.float32)
 
     def work(first: int, last: int) -> None:
-        _divide_rows(spectrum[first:last], column[first:last], row)
+        rows = slice(first, last)
+        _divide_rows(spectrum[rows], column[rows], row, short[0][rows], short[1],
+                     long[0][rows], long[1], pole)
 
     for_bands(len(spectrum), BAND, work)
-    if response is not None:
-        spectrum *= response
     result: NDArray[np.float32] = scipy.fft.idctn(
         spectrum, type=2, overwrite_x=True, workers=workers)
     return result
@@ -238,13 +247,15 @@ def _divergence_rows(du, dv, first, last, out):    # type: ignore[no-untyped-def
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def _divide_rows(spectrum, column, row):    # type: ignore[no-untyped-def]
+def _divide_rows(spectrum, column, row, short_y, short_x,    # type: ignore[no-untyped-def]
+                 long_y, long_x, pole):
     rows, width = spectrum.shape
     for y in range(rows):
         for x in range(width):
             eigenvalue = column[y] + row[x]
-            spectrum[y, x] = (spectrum[y, x] / eigenvalue if eigenvalue < 0
-                              else np.float32(0))    # the mean is free: zero
+            passed = short_y[y] * short_x[x] - long_y[y] * long_x[x]
+            # the mean is free: zero
+            spectrum[y, x] *= passed / (eigenvalue - pole) if eigenvalue < 0 else np.float32(0)
 
 
 @numba.njit(nogil=True, cache=True, error_model='numpy')

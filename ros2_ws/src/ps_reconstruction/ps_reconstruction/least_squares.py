@@ -77,23 +77,22 @@ def solve(problem: Problem, quality: bool = True, out: Solution | None = None) -
         if not quality:
             return 0.0, 0.0, 0
         grey = np.tensordot(weights, scaled_normal, 1) if problem.colour else scaled_normal[0]
-        tally = np.zeros((3, last - first, width), np.float32)
-        flags = np.zeros((last - first, width), np.uint8)
+        tally = np.zeros((4, last - first, width), np.float32)
+        no_light = np.zeros_like(planes[0][0])
         for t, frame in enumerate(frames):
-            level = frame.max(axis=-1) if problem.colour else frame
             if raw:
-                dark = np.zeros_like(frame) if ambient is None else ambient
-                _compare(frame, dark, level, forward[t], problem.step, first, problem.saturation,
-                         grey, tally, flags)
+                value, dark = frame, no_light if ambient is None else ambient
             else:
                 value = np.tensordot(weights, [plane[t] for plane in planes], 1)
-                _compare(value, np.zeros_like(value), level, forward[t], problem.step, first,
-                         problem.saturation, grey, tally, flags)
+                dark = no_light
+            level = frame.max(axis=-1) if problem.colour else frame
+            _compare(value, dark, level, forward[t], problem.step, first,
+                     np.float32(problem.saturation), grey, tally)
         assert result.confidence is not None
         assert result.reason is not None
         squares, brightness, count = _judge(
-            result.normal[rows], tally, flags, problem.count,
-            result.confidence[rows], result.reason[rows])
+            result.normal[rows], tally, problem.count, result.confidence[rows],
+            result.reason[rows])
         if mask is not None:
             result.reason[rows][~mask] = MASKED
         return squares, brightness, count
@@ -144,8 +143,9 @@ def check_lights(lights: NDArray) -> None:
                       f'{count} frames lit by a single panel; photometric stereo needs at least 3')
     if not np.all(np.isfinite(lights)):
         raise PsError(ErrorCode.RECONSTRUCTION_BAD_STACK, 'lights: light vectors are not finite')
-    values = np.linalg.svd(lights, compute_uv=False)
-    condition = float(np.max(values[..., 0] / np.maximum(values[..., 2], 1e-300)))
+    square = np.linalg.eigvalsh(np.swapaxes(lights, -1, -2) @ lights)
+    condition = float(np.sqrt(np.max(
+        square[..., 2] / np.maximum(square[..., 0], 1e-14 * square[..., 2] + 1e-300))))
     if condition > MAX_CONDITION:
         raise PsError(ErrorCode.RECONSTRUCTION_DEGENERATE_LIGHTS,
                       'the light directions lie (nearly) in one plane: condition number '
@@ -155,7 +155,9 @@ def check_lights(lights: NDArray) -> None:
 def pseudo_inverse(lights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Pseudo-inverse of the light matrix at every node, (gh, gw, T, 3) to (gh, gw, 3, T)."""
     check_lights(lights)
-    return np.asarray(np.linalg.pinv(lights), np.float64)
+    transposed = np.swapaxes(lights, -1, -2)
+    # the condition number is bounded: float64 normal equations are good to 1e-10
+    return np.asarray(np.linalg.inv(transposed @ lights) @ transposed, np.float64)
 
 
 def _grouped(inverse: NDArray) -> list[NDArray[np.float32]]:
@@ -264,16 +266,17 @@ def _finish(total, weights, normal, albedo):    # type: ignore[no-untyped-def]
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def _compare(frame, ambient, level, forward, step, first, saturation, total, tally, flags):    # type: ignore[no-untyped-def]
+def _compare(frame, ambient, level, forward, step, first,    # type: ignore[no-untyped-def]
+             saturation, total, tally):
     """Compare one frame of a band with what its scaled normals (3, h, W) predict.
 
-    :param forward: (gh, gw, 4) float32, light vector and factor at the nodes.
     :param level: (h, W) raw counts to hold against ``saturation``.
-    :param tally: (3, h, W), adds: squared residual; intensity; 1 if the frame cannot be trusted.
-    :param flags: (h, W) uint8, gets SHADOW and SATURATED.
+    :param forward: (gh, gw, 4) float32, light vector and factor at the nodes.
+    :param tally: (4, h, W), adds: squared residual; intensity; 1 if dark; 1 if saturated.
     """
     rows, width = frame.shape
     node = np.empty((2, 4), np.float32)
+    zero, one, dark_square = np.float32(0), np.float32(1), np.float32(DARK * DARK)
     for y in range(rows):
         i = (first + y) // step
         fy = np.float32((first + y) - i * step) / np.float32(step)
@@ -287,48 +290,47 @@ def _compare(frame, ambient, level, forward, step, first, saturation, total, tal
             d1 = (node[1, 1] - s1) / np.float32(step)
             d2 = (node[1, 2] - s2) / np.float32(step)
             d3 = (node[1, 3] - s3) / np.float32(step)
-            begin = j * step
-            for x in range(begin, min(begin + step, width)):
-                k = np.float32(x - begin)
+            begin, end = j * step, min((j + 1) * step, width)
+            counts, offset, raw = (
+                frame[y, begin:end], ambient[y, begin:end], level[y, begin:end])
+            gx, gy, gz = total[0, y, begin:end], total[1, y, begin:end], total[2, y, begin:end]
+            squares, sums = tally[0, y, begin:end], tally[1, y, begin:end]
+            darks, saturated = tally[2, y, begin:end], tally[3, y, begin:end]
+            for x in range(end - begin):
+                k = np.float32(x)
                 sx, sy, sz = s0 + k * d0, s1 + k * d1, s2 + k * d2
-                gx, gy, gz = total[0, y, x], total[1, y, x], total[2, y, x]
-                value = (np.float32(frame[y, x]) - np.float32(ambient[y, x])) * (s3 + k * d3)
-                residual = value - (gx * sx + gy * sy + gz * sz)
-                dark = value * value < np.float32(DARK * DARK) * (
-                    (gx * gx + gy * gy + gz * gz) * (sx * sx + sy * sy + sz * sz))
-                dark = dark or value <= 0
-                saturated = level[y, x] >= saturation
-                tally[0, y, x] += residual * residual
-                tally[1, y, x] += value
-                tally[2, y, x] += np.float32(1) if dark or saturated else np.float32(0)
-                flags[y, x] |= (np.uint8(SHADOW) if dark else np.uint8(0)) | (
-                    np.uint8(SATURATED) if saturated else np.uint8(0))
+                value = (np.float32(counts[x]) - np.float32(offset[x])) * (s3 + k * d3)
+                residual = value - (gx[x] * sx + gy[x] * sy + gz[x] * sz)
+                limit = dark_square * ((gx[x] * gx[x] + gy[x] * gy[x] + gz[x] * gz[x])
+                                       * (sx * sx + sy * sy + sz * sz))
+                squares[x] += residual * residual
+                sums[x] += value
+                darks[x] += one if max(value, zero) * value <= limit else zero
+                saturated[x] += one if np.float32(raw[x]) >= saturation else zero
 
 
-@numba.njit(nogil=True, cache=True, error_model='numpy')
-def _judge(normal, tally, flags, count, confidence, reason):    # type: ignore[no-untyped-def]
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def _judge(normal, tally, count, confidence, reason):    # type: ignore[no-untyped-def]
     """Confidence and reason of a band; returns the sums behind residual_rms."""
-    rows, width = flags.shape
-    squares, brightness, valid = 0.0, 0.0, 0
+    rows, width = confidence.shape
+    total_square, total_mean, valid = 0.0, 0.0, 0
+    one, few = np.float32(1), np.float32(1) / np.float32(max(count - 3, 1))
+    share, sharpness = one / np.float32(count), np.float32(1 / RESIDUAL_HALF ** 2)
+    redundant = np.float32(1 if count > 3 else 0)
     for y in range(rows):
         for x in range(width):
-            reason[y, x] = flags[y, x]
-            if np.isnan(normal[y, x, 2]):
-                confidence[y, x] = 0
-                reason[y, x] |= FEW_LIGHTS
-                continue
-            mean = tally[1, y, x] / count
-            variance = tally[0, y, x] / max(count - 3, 1)
-            squares += variance
-            brightness += mean
-            valid += 1
-            usable = count - tally[2, y, x]
-            score = usable / count
-            if count > 3:
-                relative = variance / max(mean * mean, np.float32(1e-20))
-                score /= 1 + relative / (RESIDUAL_HALF * RESIDUAL_HALF)
-            if usable < 3:
-                reason[y, x] |= FEW_LIGHTS
-                score *= 0.25
-            confidence[y, x] = max(1, int(255 * score + 0.5))
-    return squares, brightness, valid
+            dark, saturated = tally[2, y, x], tally[3, y, x]
+            mean, variance = tally[1, y, x] * share, tally[0, y, x] * few
+            usable = np.float32(count) - dark - saturated
+            known = not np.isnan(normal[y, x, 2])
+            relative = redundant * variance / max(mean * mean, np.float32(1e-20))
+            score = max(usable, one) * share / (one + relative * sharpness)
+            score *= np.float32(0.25) if usable < 3 else one
+            confidence[y, x] = np.uint8(max(score * 255 + np.float32(0.5), one)) if known else 0
+            flags = (SHADOW if dark > 0 else 0) | (SATURATED if saturated > 0 else 0)
+            reason[y, x] = flags | (FEW_LIGHTS if usable < 3 or not known else 0)
+            if known:
+                total_square += variance
+                total_mean += mean
+                valid += 1
+    return total_square, total_mean, valid

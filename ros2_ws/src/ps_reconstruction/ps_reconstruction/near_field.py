@@ -4,8 +4,10 @@ Near field: each node gets the light vector of every panel at its point of the s
 surface is the reference plane plus, after `surface_heights`, the heights found so far.
 """
 from dataclasses import replace
+from functools import partial
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,12 +16,13 @@ from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import CameraGeometry
 from ps_head_driver.light_model import light_vectors
 from ps_head_driver.stack import Light, Plane, Stack
+from ps_reconstruction.bands import for_bands
 from ps_reconstruction.integration import Rays, height_from_normals, parallel_rays
 from ps_reconstruction.least_squares import solve
 from ps_reconstruction.problem import GREY_WEIGHTS, Problem, grid_size
 from ps_reconstruction.weighted_integration import integrate
 
-NODES = 64                    # along the longer side: 0.001 degrees off the exact light vectors
+NODES = 40                    # along the longer side: 0.003 degrees off the exact light vectors
 COARSE_PIXELS = 320           # longer side of the picture on which height and light alternate
 BAD = ErrorCode.RECONSTRUCTION_BAD_STACK
 FULL_SCALE = {'uint8': 255.0, 'uint16': 65535.0, 'float32': 1.0}
@@ -180,14 +183,14 @@ def surface_heights(stack: Stack, rounds: int, tolerance: float = 2e-5
     columns, rows = np.meshgrid(np.arange(gw) * step, np.arange(gh) * step)
     at_nodes: NDArray[np.float64] = np.zeros((gh, gw))
     height = np.zeros(small.shape, np.float32)
+    masked = partial(integrate, steepness=0.0, tolerance=1e-3)
     done = 0
     for done in range(1, rounds + 1):    # noqa: B007
         solution = solve(photometric_problem(small, height=at_nodes), quality=False)
-        pitch = 1 / small.camera.fx
+        whole = np.isfinite(solution.normal[..., 2]).all()
         height = height_from_normals(
             solution.normal, rays, small.plane.normal, small.plane.offset,
-            solver=lambda du, dv, p=pitch: integrate(    # type: ignore[misc]
-                du, dv, steepness=0, pitch=p))
+            solver=None if whole else masked)
         height[~np.isfinite(height)] = 0
         height = np.asarray(cv2.GaussianBlur(height, (0, 0), step / 2))
         new = _sample(height, columns, rows)
@@ -255,21 +258,39 @@ def _reduced(stack: Stack) -> tuple[Stack, int]:
         return stack, 1
     rows, columns = (max(2, n // factor) for n in stack.shape)
 
-    def shrink(image: NDArray) -> NDArray:
-        cut = np.ascontiguousarray(image[:rows * factor, :columns * factor])
-        return np.asarray(cv2.resize(cut, (columns, rows), interpolation=cv2.INTER_AREA))
+    def shrink(image: NDArray) -> NDArray[np.float32]:
+        return _block_means(image, factor, rows, columns, 1 / FULL_SCALE[str(image.dtype)])
 
     # the last rows and columns that fill no block are cut off
     cut = stack.camera.model_copy(update={
         'width_px': columns * factor, 'height_px': rows * factor})
     camera = scaled_camera(cut, columns, rows)
-    mask = None if stack.mask is None else shrink(stack.mask.astype(np.uint8) * 255) > 250
-    # block means of 8-bit pictures are worth more than 8 bits
+    # a block counts if all its pixels do
+    mask = None if stack.mask is None else shrink(stack.mask.astype(np.float32)) > 0.999
     return replace(
-        stack, images=[shrink(_as_float(image)) for image in stack.images], camera=camera,
-        ambient=None if stack.ambient is None else shrink(_as_float(stack.ambient)),
+        stack, images=[shrink(image) for image in stack.images], camera=camera,
+        ambient=None if stack.ambient is None else shrink(stack.ambient),
         mask=mask), factor
 
 
-def _as_float(image: NDArray) -> NDArray[np.float32]:
-    return (image * np.float32(1 / FULL_SCALE[str(image.dtype)])).astype(np.float32)
+def _block_means(image: NDArray, factor: int, rows: int, columns: int, scale: float
+                 ) -> NDArray[np.float32]:
+    """Mean of factor x factor pixels, times ``scale``; worth more than the 8 bits of a pixel."""
+    planes = image.reshape(*image.shape[:2], -1)
+    out = np.empty((rows, columns, planes.shape[2]), np.float32)
+    for_bands(rows, 8, lambda i, j: _block_rows(
+        planes[i * factor:j * factor], factor, np.float32(scale / factor ** 2), out[i:j]))
+    return out.reshape(rows, columns, *image.shape[2:])
+
+
+@numba.njit(nogil=True, cache=True)
+def _block_rows(planes, factor, scale, out):    # type: ignore[no-untyped-def]
+    rows, columns, channels = out.shape
+    for y in range(rows):
+        for x in range(columns):
+            for c in range(channels):
+                total = np.float32(0)
+                for b in range(factor):
+                    for a in range(factor):
+                        total += np.float32(planes[y * factor + b, x * factor + a, c])
+                out[y, x, c] = total * scale

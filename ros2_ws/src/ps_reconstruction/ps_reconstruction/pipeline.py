@@ -131,7 +131,6 @@ def reconstruct(stack: Stack, options: Options | None = None,
                           'set near_field to false to do without')
         heights = None
         if near:
-            least_squares.check_lights(photometric_problem(stack).lights)
             heights, _ = surface_heights(stack, options.height_rounds)
         problem = photometric_problem(stack, near, options.saturation, heights)
     with _timed(timings, 'normals'):

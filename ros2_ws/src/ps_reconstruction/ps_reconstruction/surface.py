@@ -14,7 +14,6 @@ from ps_reconstruction.bands import for_bands
 from ps_reconstruction.integration import (
     BAND,
     divergence,
-    laplace_eigenvalues,
     remove_plane,
     solve_poisson,
 )
@@ -88,28 +87,24 @@ def relief(
     sample = light[::lattice, ::lattice]
     sample = sample[np.isfinite(sample)]
     bright = max(float(np.percentile(sample, 95)), 1e-12) if sample.size else 1.0
-    square = np.nan_to_num(light) ** 2
-    trust = square / (square + np.float32((DARK_SHARE * bright) ** 2))
+    trust, flat_u, flat_v = (np.empty(du.shape, np.float32) for _ in range(3))
+    dark = np.float32((DARK_SHARE * bright) ** 2)
+    for_bands(len(du), BAND, lambda i, j: _weigh_rows(
+        du[i:j], dv[i:j], light[i:j], dark, trust[i:j], flat_u[i:j], flat_v[i:j]))
     factor = max(1, int(long_px / 4))
     size = (max(1, du.shape[1] // factor), max(1, du.shape[0] // factor))
 
-    def local_mean(values: NDArray) -> NDArray:
+    def local_sum(values: NDArray) -> NDArray:
         small = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
         return np.asarray(cv2.GaussianBlur(small, (0, 0), long_px / factor))
 
-    weight = local_mean(trust) + np.float32(1e-6)
-    flat = []
-    for gradient in (du, dv):
-        known = np.nan_to_num(gradient)
-        mean = cv2.resize(local_mean(known * trust) / weight, du.shape[::-1],
-                          interpolation=cv2.INTER_LINEAR)
-        flat.append((known - mean) * trust)
-    right = divergence(flat[0], flat[1])
-    column, row = (laplace_eigenvalues(n).astype(np.float32) for n in right.shape)
-    response = column[:, None] + row
-    response = np.exp(np.float32(0.5 * short_px ** 2) * response) * (
-        response / (response - np.float32(1 / long_px ** 2)))
-    return solve_poisson(right, response)
+    weight = local_sum(trust) + np.float32(1e-6)
+    for weighted in (flat_u, flat_v):
+        mean = np.asarray(cv2.resize(local_sum(weighted) / weight, du.shape[::-1],
+                                     interpolation=cv2.INTER_LINEAR))
+        mean *= trust
+        weighted -= mean
+    return solve_poisson(divergence(flat_u, flat_v), short_px, pole_px=long_px)
 
 
 def shape_image(
@@ -146,16 +141,7 @@ def band_passed(du: NDArray[np.float32], dv: NDArray[np.float32], short_px: floa
     :param short_px: sigma below which form is smoothed away; 0 for none.
     :param long_px: sigma above which form is flattened away; 0 for none.
     """
-    right = divergence(du, dv)
-    transfers = []
-    for sigma in (short_px, long_px):
-        transfers.append([np.exp(0.5 * sigma ** 2 * laplace_eigenvalues(n)).astype(np.float32)
-                          for n in right.shape])
-    (short_y, short_x), (long_y, long_x) = transfers
-    response = np.outer(short_y, short_x)
-    if long_px > 0:
-        response -= np.outer(long_y, long_x)
-    return solve_poisson(right, response)
+    return solve_poisson(divergence(du, dv), short_px, long_px)
 
 
 def roughness(
@@ -251,3 +237,19 @@ def _grey_rows(relief, valid, middle, gain, out):    # type: ignore[no-untyped-d
                 value = (relief[y, x] - middle) * gain
                 grey = value / (np.float32(1) + abs(value))
             out[y, x] = np.uint8(np.float32(NEUTRAL) + np.float32(127) * grey + np.float32(0.5))
+
+
+@numba.njit(nogil=True, cache=True, error_model='numpy')
+def _weigh_rows(du, dv, light, dark, trust, out_u, out_v):    # type: ignore[no-untyped-def]
+    """Trust in the slopes of pixels of some brightness, and the slopes times it."""
+    rows, width = du.shape
+    for y in range(rows):
+        for x in range(width):
+            square = light[y, x] * light[y, x]
+            share = square / (square + dark)
+            if np.isnan(share) or np.isnan(du[y, x]) or np.isnan(dv[y, x]):
+                trust[y, x] = out_u[y, x] = out_v[y, x] = np.float32(0)
+            else:
+                trust[y, x] = share
+                out_u[y, x] = share * du[y, x]
+                out_v[y, x] = share * dv[y, x]

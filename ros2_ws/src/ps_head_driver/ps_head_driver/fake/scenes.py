@@ -80,9 +80,11 @@ class Scene:
                               'view; give it a larger size')
 
 
-def _plate(x: NDArray, y: NDArray, albedo: float = 0.8) -> dict[str, Any]:
-    """Flat matt plate in the plane z = 0."""
-    return {'height': np.zeros_like(x), 'albedo': albedo}
+def _plate(x: NDArray, y: NDArray, albedo: float = 0.8, specular: float = 0.0,
+           roughness: float = 0.3) -> dict[str, Any]:
+    """Flat plate in the plane z = 0, matt unless specular is given."""
+    return {'height': np.zeros_like(x), 'albedo': albedo, 'specular': specular,
+            'roughness': roughness}
 
 
 def _tilted_plate(x: NDArray, y: NDArray, tilt_x: float = math.radians(5.0),

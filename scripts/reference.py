@@ -6,20 +6,22 @@ import importlib
 from pathlib import Path
 import re
 import sys
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / 'docs' / 'reference.md'
 HEAD = """# Reference: parameters and error codes
 
-Made by `make reference` from the code; do not edit. Topics, services and actions are in the [README](../README.md); the fields
-of every message are explained in the files under `ros2_ws/src/ps_interfaces`.
+Made by `make reference` from the code; do not edit. Topics, services and actions are in the
+[README](../README.md); the files under `ros2_ws/src/ps_interfaces` explain every message field.
 """
 
 
 def parameter_tables() -> str:
     """One table for each node, from its PARAMETERS."""
     from ps_inspection.graph import NODES
-    parts = ['\n## Parameters\n\n*[start]*: read once, at start; the others can be set at run time.\n']
+    parts = ['\n## Parameters\n\n'
+             '*[start]*: read once, at start; the others can be set at run time.\n']
     for node in NODES:
         module = importlib.import_module(f'{node.package}.nodes.{node.executable}')
         parts.append(f'\n### {node.executable} ({node.package})\n\n'
@@ -30,14 +32,15 @@ def parameter_tables() -> str:
 
 
 def _show(value: object) -> str:
-    return f'{value:.6g}' if isinstance(value, float) else repr(value).replace('True', 'true').replace('False', 'false')
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'{value:.6g}' if isinstance(value, float) else repr(value)
 
 
-def _range(parameter: object) -> str:
-    low, high, unit = parameter.minimum, parameter.maximum, parameter.unit  # type: ignore[attr-defined]
-    choices = parameter.choices  # type: ignore[attr-defined]
-    if choices:
-        return ', '.join(f'`{choice}`' for choice in choices)
+def _range(parameter: Any) -> str:
+    low, high, unit = parameter.minimum, parameter.maximum, parameter.unit
+    if parameter.choices:
+        return ', '.join(f'`{choice}`' for choice in parameter.choices)
     if low is None and high is None:
         return unit
     if high is None:

@@ -1,4 +1,4 @@
-"""What tests of the running graph share: an own ROS domain, and the check that nothing is left behind."""
+"""What tests of the running graph share: an own ROS domain, and real data."""
 from collections.abc import Iterator
 import fcntl
 import os
@@ -7,7 +7,7 @@ import tempfile
 
 import pytest
 
-DATA = Path(os.environ.get('PS_DATA', Path(__file__).resolve().parents[1] / '..' / 'shared' / 'data'))
+DATA = Path(os.environ.get('PS_DATA', Path(__file__).resolve().parents[2] / 'shared' / 'data'))
 
 
 @pytest.fixture(scope='module')
@@ -38,7 +38,7 @@ def ros_domain() -> Iterator[int]:
 
 @pytest.fixture(scope='session')
 def data_folder() -> Path:
-    """Real pictures with ground truth; a test that needs them is skipped where they are missing."""
+    """Real pictures with ground truth; tests that need them are skipped without them."""
     if not DATA.is_dir():
         pytest.skip(f'no test data at {DATA}; set PS_DATA')
     return DATA

@@ -48,7 +48,7 @@ def test_name_is_in_the_readme(name):
     assert name in README
 
 
-@pytest.mark.parametrize('package', sorted(path.parent.name for path in SOURCES.glob('*/setup.py')))
+@pytest.mark.parametrize('package', sorted(p.parent.name for p in SOURCES.glob('*/setup.py')))
 def test_executables_are_documented(package):
     setup = (SOURCES / package / 'setup.py').read_text()
     for name in re.findall(r"'(\w+) = ", setup):

@@ -19,7 +19,7 @@ setup(
     zip_safe=True,
     maintainer='ps_head maintainers',
     maintainer_email='maintainers@ps-head.invalid',
-    description='The head: kinematics, convergence radius, light model, link, cameras, fake hardware.',
+    description='The head: kinematics, light model, link, cameras, fake hardware.',
     license='Apache-2.0',
     entry_points={
         'console_scripts': [

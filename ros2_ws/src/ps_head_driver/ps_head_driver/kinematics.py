@@ -157,10 +157,9 @@ class BrightFieldKinematics:
         m = np.asarray(m_counts)
         low, high = self.limits_counts
         if np.any(m < low) or np.any(m > high):
+            wrong = m[(m < low) | (m > high)].ravel()[0]
             raise PsError(ErrorCode.CR_OUT_OF_LIMITS,
-                          f'motor counts {np.min(m)} to {np.max(m)} are outside {low} to {high}'
-                          if m.size > 1 else
-                          f'motor counts {int(m)} are outside {low} to {high}')
+                          f'motor counts {wrong:g} are outside {low} to {high}')
 
     def tilt(self, m_counts: ArrayLike) -> Any:
         """Nominal tilt of all four panels, rad; 0 faces straight down.
@@ -194,9 +193,9 @@ class BrightFieldKinematics:
         if np.all(below >= 0):
             m = self._slider.m0_counts + (
                 pin_z + np.sqrt(below) - self._slider.z_at_m0) / self._dz_dm
-            low, high = self.limits_counts
-            if np.all((m >= low - 0.5) & (m <= high + 0.5)):
-                m = np.clip(m, low, high)
+            first, last = self.limits_counts
+            if np.all((m >= first - 0.5) & (m <= last + 0.5)):
+                m = np.clip(m, first, last)
                 if np.allclose(self.tilt(m), tilt, rtol=0, atol=1e-4):
                     return m
         low, high = self.tilt_limits

@@ -206,11 +206,12 @@ def gain_map(images: Sequence[np.ndarray], ambient: np.ndarray | None, height: i
     :returns: (height, width) float32, in the unit of the pictures, at least 1/1000 of its maximum.
     """
     import cv2
-    mean = np.mean([np.asarray(image, np.float32) for image in images], axis=0, dtype=np.float32)
+    stacked = np.stack([np.asarray(image, np.float32) for image in images])
+    mean = np.asarray(stacked.mean(axis=0), np.float32)
     if ambient is not None:
         mean = mean - ambient.astype(np.float32)
     if mean.ndim == 3:
-        mean = mean.mean(axis=2)
+        mean = np.asarray(mean.mean(axis=2), np.float32)
     height = min(height, mean.shape[0])
     width = max(1, round(mean.shape[1] * height / mean.shape[0]))
     small = cv2.resize(mean, (width, height), interpolation=cv2.INTER_AREA)

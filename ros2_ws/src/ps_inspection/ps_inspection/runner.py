@@ -109,7 +109,7 @@ class Cell:
         folder = self.log_folder or Path(tempfile.mkdtemp(prefix='ps_cell_'))
         self.log_folder = folder
         folder.mkdir(parents=True, exist_ok=True)
-        environment = {**os.environ, **cell_environment(), **self.environment}
+        environment = self._node_environment()
         self._started = time.monotonic()
         try:
             for start in self._starts:
@@ -118,6 +118,24 @@ class Cell:
         except BaseException:
             self.stop()
             raise
+
+    def restart(self, name: str) -> None:
+        """Start one node again, stopping it first if it runs, and return when it is ready.
+
+        :raises CellError: as of start; the other nodes keep running.
+        """
+        node = next(node for node in self.processes if node.name == name)
+        _stop([node], self.grace)
+        if name == HEAD_DRIVER.executable:
+            self.head_status = None      # what the old one said last
+        assert self.log_folder is not None
+        self._started = time.monotonic()
+        self.processes[self.processes.index(node)] = _spawn(
+            node.start, self.log_folder, self._node_environment())
+        self._wait_until_ready()
+
+    def _node_environment(self) -> dict[str, str]:
+        return {**os.environ, **cell_environment(), **self.environment}
 
     def check(self) -> None:
         """Raise CellError if a node has died."""

@@ -50,8 +50,9 @@ PARAMETERS = [
               0.1, 120.0),
     Parameter('time_tolerance', 0.002, 'Allowed difference of frame and strobe times', 's',
               0.0, 1.0),
-    Parameter('head_timeout', 30.0, 'Longest wait for a move or a strobe program', 's',
-              1.0, 300.0),
+    Parameter('move_timeout', 30.0, 'Longest wait for a move of the panels', 's', 1.0, 300.0),
+    Parameter('program_margin', 5.0, 'Longest wait for a strobe program beyond its own duration',
+              's', 0.5, 60.0),
     Parameter('flat_height', 256, 'Rows of a stored flat-field picture', 'px', 16, 4096),
     Parameter('trigger_socket', '', 'Fake camera: where the emulator announces strobes; empty: '
               'derived from namespace and domain', read_only=True),
@@ -124,6 +125,12 @@ class CameraSequencer(Node):
         self.camera: Camera = make_camera(self.parameters['camera'], CameraSettings(
             node=self, head=self.head, parameters=self.parameters))
         self._camera_open = False
+        try:
+            self._open_camera()
+        except PsError as error:
+            if error.code != ErrorCode.SEQUENCER_CAMERA_LOST:
+                raise
+            self.get_logger().warning(f'{error.message}; tried again at the next capture')
 
         latched, reliable = ros_support.LATCHED, ros_support.RELIABLE
         parallel = ReentrantCallbackGroup()
@@ -287,9 +294,7 @@ class CameraSequencer(Node):
     ) -> _Acquisition:
         """Run the programs of a recipe and collect its frames."""
         state = AcquireStack.Feedback
-        if not self._camera_open:
-            self.camera.open()
-            self._camera_open = True
+        self._open_camera()
         frames: list[Frame] = []
         lights: list[Light] = []
         duration = 0.0
@@ -300,7 +305,8 @@ class CameraSequencer(Node):
                 progress(state.MOVING, len(frames), False)
                 self._ask_head(self._illuminate, SetIllumination.Request(
                     by=SetIllumination.Request.BY_CONVERGENCE_RADIUS,
-                    convergence_radius=segment.convergence_radius))
+                    convergence_radius=segment.convergence_radius),
+                    self.parameters['move_timeout'])
             self._check_cancelled()
             progress(state.ARMING, len(frames), False)
             shots = segment.shots
@@ -310,8 +316,10 @@ class CameraSequencer(Node):
             try:
                 self._check_cancelled()
                 progress(state.EXPOSING, len(frames), False)
-                answer = self._ask_head(self._run_program, RunStrobeProgram.Request(
-                    steps=[self._strobe_step(shot) for shot in shots]))
+                steps = [self._strobe_step(shot) for shot in shots]
+                duration_s = sum(s.settle + s.strobe_duration + s.period for s in steps)
+                answer = self._ask_head(self._run_program, RunStrobeProgram.Request(steps=steps),
+                                        duration_s + self.parameters['program_margin'])
                 own = [
                     replace(message_to_light(light), exposure_time=shot.exposure,
                             gain=self.parameters['gain'])
@@ -334,15 +342,19 @@ class CameraSequencer(Node):
             ambient, frames, lights = frames[-1], frames[:-1], lights[:-1]
         return _Acquisition(frames, lights, ambient, duration)
 
+    def _open_camera(self) -> None:
+        if not self._camera_open:
+            self.camera.open()
+            self._camera_open = True
+
     def _strobe_step(self, shot: sequence.Shot) -> ps.StrobeStep:
         return ps.StrobeStep(
             mode=int(shot.mode), panel=int(shot.panel), intensity=shot.intensity,
             settle=self.parameters['settle'], strobe_duration=shot.exposure,
             period=max(self.parameters['frame_period'], shot.exposure))
 
-    def _ask_head(self, client: Any, request: Any) -> Any:
-        answer = call(client, request, self.parameters['head_timeout'],
-                      ErrorCode.SEQUENCER_HEAD_UNAVAILABLE)
+    def _ask_head(self, client: Any, request: Any, timeout: float) -> Any:
+        answer = call(client, request, timeout, ErrorCode.SEQUENCER_HEAD_UNAVAILABLE)
         if not answer.success:
             name = _code_name(answer.error_code)
             self._check_cancelled()
@@ -393,8 +405,13 @@ class CameraSequencer(Node):
     def _with_source(stack: Stack, source: Stack) -> Stack:
         """Pictures from a folder bring their own lights, camera and flat field."""
         by_panel = {(light.mode, light.panel): i for i, light in enumerate(source.lights)}
-        order = [by_panel[light.mode, light.panel] for light in stack.lights]
-        own = source.subset(order)
+        missing = [light.name for light in stack.lights
+                   if (light.mode, light.panel) not in by_panel]
+        if missing:
+            raise PsError(ErrorCode.SEQUENCER_BAD_REQUEST,
+                          f'the folder states no light for {", ".join(missing)}; use a recipe of '
+                          'the single panels it has')
+        own = source.subset([by_panel[light.mode, light.panel] for light in stack.lights])
         return replace(
             stack, camera=source.camera, geometry=source.geometry, plane=source.plane,
             mask=source.mask, gain_maps=own.gain_maps, flat_id='folder' if own.gain_maps else '',

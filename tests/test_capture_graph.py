@@ -1,0 +1,253 @@
+"""The whole chain as real processes over DDS: capture to published slope, refusals, restarts."""
+from collections.abc import Iterator
+from pathlib import Path
+import threading
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip('ps_interfaces.msg', reason='needs the built workspace (make setup)')
+
+from rclpy.action import ActionClient
+
+from ps_head_driver.conversions import message_to_image, message_to_stack
+from ps_head_driver.errors import ErrorCode, PsError
+from ps_head_driver.fake.renderer import make_renderer
+from ps_head_driver.frames import optical_to_plane
+from ps_head_driver.head_model import load_head, nominal_head_path
+from ps_head_driver.stack import Panel, angular_error_deg
+from ps_inspection.cell_client import CellClient
+from ps_inspection.runner import Cell
+from ps_interfaces import action, srv
+from ps_interfaces import msg as ps
+from ps_reconstruction.pipeline import reconstruct
+
+pytestmark = pytest.mark.graph
+SCALE = 0.25
+OUTPUTS = ('slope', 'normal', 'height', 'shape', 'confidence', 'preview')
+
+
+@pytest.fixture(scope='module')
+def cell(ros_domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
+    folder = tmp_path_factory.mktemp('cell')
+    settings = folder / 'small.yaml'
+    settings.write_text(f'/**:\n  ros__parameters:\n    scale: {SCALE}\n')
+    arguments = {
+        'fake_hardware': 'true', 'camera': 'fake', 'scene': 'dome', 'params_file': str(settings),
+        'session_folder': str(folder / 'sessions')}
+    with Cell(arguments, log_folder=folder / 'logs') as running:
+        pids = [node.process.pid for node in running.processes]
+        yield running
+    assert not any(Path(f'/proc/{pid}').exists() for pid in pids)
+
+
+@pytest.fixture(scope='module')
+def client(cell: Cell) -> Iterator[CellClient]:
+    with CellClient(outputs=OUTPUTS) as connected:
+        connected.home()
+        connected.illuminate(0.06)
+        yield connected
+
+
+def test_capture_to_published_slope(client: CellClient):
+    stack_id = client.capture(part_id='part-1')
+    message = client.stack(stack_id)
+    info, images = client.reconstruction(stack_id)
+    done = client.done[stack_id][0]
+    assert done.success
+    assert client.done[stack_id][1] <= client.stacks[stack_id][1]   # before the stack, not after
+
+    stack = message_to_stack(message)
+    assert [light.panel for light in stack.lights] == [Panel.E, Panel.N, Panel.W, Panel.S]
+    assert stack.part_id == info.part_id == 'part-1'
+    assert stack.convergence_radius == pytest.approx(0.06, abs=5e-4)
+    counters = [light.strobe_counter for light in stack.lights]
+    assert counters == list(range(counters[0], counters[0] + 4))
+
+    stamp = message.header.stamp
+    assert set(images) == set(OUTPUTS)
+    for image in images.values():
+        assert image.header.stamp == stamp
+        assert image.header.frame_id == 'ps_head_camera_optical_frame'
+    assert {name: image.encoding for name, image in images.items()} == {
+        'slope': '32FC2', 'normal': '32FC3', 'height': '32FC1', 'shape': 'mono8',
+        'confidence': 'mono8', 'preview': 'rgb8'}
+
+    normal = message_to_image(images['normal'])
+    assert np.nanmax(normal[..., 2]) < 0           # visible surfaces face the camera
+    truth = make_renderer('dome', load_head(nominal_head_path()), scale=SCALE).truth()
+    error = angular_error_deg(optical_to_plane(normal), truth.normal)
+    assert np.nanmedian(error) < 1.5
+    slope = message_to_image(images['slope'])
+    columns = np.arange(slope.shape[1])
+    right = (truth.height > 5e-4) & (columns > 0.6 * slope.shape[1])
+    assert np.nanmean(slope[..., 0][right]) < -0.05   # a dome falls to the right on its right side
+
+
+def test_offline_reconstruction_of_the_stack_is_the_same(client: CellClient):
+    stack_id = client.capture()
+    message = client.stack(stack_id)
+    _, images = client.reconstruction(stack_id)
+    offline = reconstruct(message_to_stack(message), outputs={'slope'})
+    np.testing.assert_array_equal(offline.slope, message_to_image(images['slope']))
+
+
+def test_explicit_steps_with_ambient_over_the_action(client: CellClient):
+    steps = [ps.LightStep(mode=mode, panel=panel)
+             for mode in (ps.Panel.BRIGHT_FIELD, ps.Panel.DARK_FIELD) for panel in (0, 2)]
+    result, feedback = acquire(client, steps=steps, ambient_frame=True, part_id='x')
+    assert result.success, result.message
+    stack = message_to_stack(client.stack(result.stack_id))
+    assert [light.name for light in stack.lights] == ['BF_E', 'BF_W', 'DF_E', 'DF_W']
+    assert stack.ambient is not None
+    assert stack.ambient.mean() < 0.1 * stack.images[0].mean()
+    assert len(result.exposure_times) == 4
+    assert feedback[-1].safe_to_move
+    assert not feedback[0].safe_to_move
+
+
+def acquire(client: CellClient, cancel_after: float | None = None, **goal):
+    feedback: list = []
+    actions = ActionClient(client.node, action.AcquireStack, 'acquire_stack')
+    try:
+        assert actions.wait_for_server(10.0)
+        accepted = wait_for(actions.send_goal_async(
+            action.AcquireStack.Goal(**goal), lambda m: feedback.append(m.feedback)))
+        assert accepted.accepted
+        if cancel_after is not None:
+            time.sleep(cancel_after)
+            wait_for(accepted.cancel_goal_async())
+        return wait_for(accepted.get_result_async()).result, feedback
+    finally:
+        actions.destroy()
+
+
+def wait_for(future, timeout: float = 60.0):
+    done = threading.Event()
+    future.add_done_callback(lambda _: done.set())
+    assert done.wait(timeout), 'no answer'
+    return future.result()
+
+
+@pytest.mark.parametrize(('kind', 'name', 'fields', 'code'), [
+    (srv.Capture, 'capture', {'recipe': 'none'}, ErrorCode.SEQUENCER_UNKNOWN_RECIPE),
+    (srv.CaptureFlat, 'capture_flat', {'recipe': 'none'}, ErrorCode.SEQUENCER_UNKNOWN_RECIPE),
+    (srv.CaptureFlat, 'capture_flat', {'recipe': 'ring_calibration', 'averages': 1},
+     ErrorCode.SEQUENCER_BAD_REQUEST),
+    (srv.SetIllumination, 'set_illumination', {'by': 99}, ErrorCode.HEAD_BAD_REQUEST),
+    (srv.SetIllumination, 'set_illumination', {'by': 0, 'convergence_radius': -1.0},
+     ErrorCode.CR_BAD_REQUEST),
+    (srv.SetIllumination, 'set_illumination', {'by': 2, 'motor_counts': 10**6},
+     ErrorCode.HEAD_OUT_OF_LIMITS),
+    (srv.SetIllumination, 'set_illumination', {'by': 3, 'intensities': [2.0] * 8},
+     ErrorCode.HEAD_BAD_REQUEST),
+    (srv.SolveConvergenceRadius, 'solve_convergence_radius', {'mode': 7},
+     ErrorCode.CR_BAD_REQUEST),
+    (srv.SolveConvergenceRadius, 'solve_convergence_radius',
+     {'mode': 1, 'branch': 1, 'convergence_radius': 9.0}, ErrorCode.CR_UNREACHABLE),
+    (srv.SolveConvergenceRadius, 'solve_convergence_radius', {'motor_counts': -5},
+     ErrorCode.CR_OUT_OF_LIMITS),
+    (srv.RunStrobeProgram, 'head_driver/run_strobe_program',
+     {'steps': [ps.StrobeStep(panel=77)]}, ErrorCode.HEAD_BAD_REQUEST),
+    (srv.CalibrationFile, 'ring_calibration/load', {'file': 'nothing.yaml'},
+     ErrorCode.CALIBRATION_FILE_NOT_FOUND),
+    (srv.CalibrationFile, 'ring_calibration/load', {'file': '../../etc/passwd'},
+     ErrorCode.CALIBRATION_BAD_REQUEST),
+    (srv.CalibrationFile, 'ring_calibration/save', {'file': 'x.yaml'},
+     ErrorCode.CALIBRATION_NONE_ACTIVE),
+    (srv.StartSession, 'session/start', {'name': '../x'}, ErrorCode.SESSION_BAD_REQUEST),
+    (srv.StopSession, 'session/stop', {}, ErrorCode.SESSION_NOT_RECORDING),
+])
+def test_wrong_request_is_answered(client: CellClient, kind, name, fields, code):
+    with pytest.raises(PsError) as error:
+        client.call(kind, name, kind.Request(**fields))
+    assert error.value.code == code, error.value.message
+    assert len(error.value.message) > 10
+
+
+def test_wrong_steps_are_answered(client: CellClient):
+    result, _ = acquire(client, steps=[ps.LightStep(panel=42)])
+    assert not result.success
+    assert result.error_code == ErrorCode.SEQUENCER_BAD_REQUEST
+
+
+def test_ring_calibration_says_that_it_is_not_there_yet(client: CellClient):
+    actions = ActionClient(client.node, action.CalibrateRing, 'calibrate_ring')
+    assert actions.wait_for_server(10.0)
+    accepted = wait_for(actions.send_goal_async(action.CalibrateRing.Goal()))
+    result = wait_for(accepted.get_result_async()).result
+    actions.destroy()
+    assert not result.success
+    assert result.error_code == ErrorCode.CALIBRATION_NOT_IMPLEMENTED
+    assert result.verdict == ps.HeadCalibration.VERDICT_FAILED
+
+
+def test_all_alive_after_the_wrong_requests(cell: Cell, client: CellClient):
+    cell.check()
+    assert client.stack(client.capture()).images
+
+
+def test_second_request_while_busy_is_refused(client: CellClient):
+    slow = [ps.LightStep(panel=i % 4, exposure_time=0.1) for i in range(12)]
+    results: list = []
+    first = threading.Thread(target=lambda: results.append(acquire(client, steps=slow)[0]))
+    first.start()
+    deadline = time.monotonic() + 20
+    code = ErrorCode.NONE
+    while code != ErrorCode.SEQUENCER_BUSY and time.monotonic() < deadline and first.is_alive():
+        try:
+            client.capture()
+        except PsError as error:
+            code = error.code
+    first.join(60)
+    assert code == ErrorCode.SEQUENCER_BUSY
+    assert results[0].success, results[0].message
+
+
+def test_cancel_publishes_nothing_and_leaves_the_cell_usable(client: CellClient):
+    slow = [ps.LightStep(panel=i % 4, exposure_time=0.2) for i in range(16)]
+    result, _ = acquire(client, cancel_after=0.8, steps=slow)
+    assert not result.success
+    assert result.error_code == ErrorCode.SEQUENCER_CANCELLED
+    time.sleep(0.5)
+    assert result.stack_id not in client.stacks
+    assert client.stack(client.capture()).images
+
+
+def test_flat_field_is_used_for_its_illumination_only(client: CellClient):
+    answer = client.call(srv.CaptureFlat, 'capture_flat', srv.CaptureFlat.Request(averages=2))
+    message = client.stack(client.capture())
+    assert message.flat_id == answer.flat_id
+    assert len(message.gain_maps) == 4
+    client.illuminate(0.03)
+    assert client.stack(client.capture()).flat_id == ''
+    client.illuminate(0.06)
+    client.call(srv.CaptureFlat, 'capture_flat', srv.CaptureFlat.Request(clear=True))
+    assert client.stack(client.capture()).flat_id == ''
+
+
+def test_killed_reconstruction_comes_back_after_a_restart(cell: Cell, client: CellClient):
+    victim = next(node for node in cell.processes if node.name == 'reconstruction')
+    victim.process.kill()
+    victim.process.wait(10)
+    client.capture()                 # the head goes on without it
+    cell.restart('reconstruction')
+    stack_id = client.capture()
+    assert client.reconstruction(stack_id)[0].success
+
+
+def test_killed_driver_comes_back_after_a_restart(cell: Cell, client: CellClient):
+    victim = next(node for node in cell.processes if node.name == 'head_driver')
+    victim.process.kill()
+    victim.process.wait(10)
+    with pytest.raises(PsError) as error:
+        client.capture()
+    assert error.value.code in (ErrorCode.SEQUENCER_HEAD_UNAVAILABLE,
+                                ErrorCode.SEQUENCER_HEAD_FAILED)
+    client.status = None
+    cell.restart('head_driver')      # homes by itself
+    client.wait(lambda: client.status is not None and client.status.state == ps.HeadStatus.READY,
+                20.0, 'READY in head_status')
+    client.illuminate(0.06)
+    assert client.stack(client.capture()).images

@@ -11,15 +11,15 @@ the object, so thousands of pixels determine them: the scaled normals are elimin
 (variable projection) and what the lights of a pixel cannot explain by any normal is fitted.
 Lambert's law is c = 0.
 
-Bi-polynomial reflectance: Shi et al., "Bi-polynomial modeling of low-frequency reflectances", TPAMI
-2014; there per pixel, here shared.
+Bi-polynomial reflectance: Shi et al., "Bi-polynomial modeling of low-frequency reflectances",
+TPAMI 2014; there per pixel, here shared.
 """
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 TERMS = 10
-LOBES = (0.004, 0.02, 0.06, 0.2)     # squared widths of the gloss lobes, in tan^2 of the half angle
+LOBES = (0.004, 0.02, 0.06, 0.2)     # widths of the gloss lobes, tan^2 of the half angle
 NODES = 64                           # of the table, per axis
 LEAST_HALF = 0.05                    # cosine to the half-vector below which nothing is predicted
 RIDGE = 1e-3                         # of the coefficients, relative to the mean information

@@ -32,7 +32,8 @@ from ps_reconstruction.stv_kernels import combine_patches, estimate_samples, fin
 BAND = 16                     # rows per band
 SAMPLES = 4000                # pixels that the plan looks at
 ROUNDS = 5                    # of the reflectance fit
-NOT_LAMBERTIAN = 0.1          # median relative residual of LS from which few lights tell nothing
+NOT_LAMBERTIAN = 0.04         # median misfit of LS from which few lights tell nothing more
+QUANTILE = 0.75               # of the misfits, by which the estimates are compared
 
 
 class Trust(IntEnum):
@@ -49,7 +50,8 @@ class StvOptions:
 
     :param patch: width of the square patch N(p) in pixels, odd; 1 for none.
     :param spatial_sigma: of the spatial Gaussian, in pixels.
-    :param edge_sigma: relative difference of the scaled normals that halves the edge-aware weight.
+    :param edge_tolerance: difference of the scaled normals that halves the edge-aware weight, as
+        a multiple of the scatter that the plan expects of them.
     :param ridge: lambda, relative to the information of the equations.
     :param rounds: repetitions of rejection and solution per pixel.
     :param trust: fixed choice instead of the one made from the data.
@@ -57,7 +59,7 @@ class StvOptions:
 
     patch: int = 5
     spatial_sigma: float = 1.0
-    edge_sigma: float = 0.05
+    edge_tolerance: float = 2.5
     ridge: float = 1e-3
     rounds: int = 2
     trust: Trust | None = None
@@ -66,7 +68,7 @@ class StvOptions:
         if self.patch % 2 == 0 or not 1 <= self.patch <= 15:
             raise PsError(ErrorCode.RECONSTRUCTION_BAD_PARAMETER,
                           f'patch: {self.patch} must be odd, 1 to 15')
-        for name in ('spatial_sigma', 'edge_sigma'):
+        for name in ('spatial_sigma', 'edge_tolerance'):
             if not getattr(self, name) > 0:
                 raise PsError(ErrorCode.RECONSTRUCTION_BAD_PARAMETER, f'{name}: must be positive')
         if not self.ridge >= 0 or not 1 <= self.rounds <= 50:
@@ -76,10 +78,14 @@ class StvOptions:
 
 @dataclass(frozen=True)
 class Plan:
-    """What holds for the whole stack: the reflectance and how far to trust it."""
+    """What holds for the whole stack: the reflectance and how far to trust it.
+
+    :param scatter: expected relative error of a pixel's own scaled normal.
+    """
 
     coefficients: NDArray[np.float64]
     trust: Trust
+    scatter: float = 0.0
 
     @property
     def table(self) -> NDArray[np.float32]:
@@ -111,6 +117,7 @@ def solve(problem: Problem, options: StvOptions | None = None, quality: bool = T
             else problem.reciprocal_flat.astype(np.float32))
     spatial = _spatial(options)
     radius = options.patch // 2
+    edge = options.edge_tolerance * decided.scatter
 
     def work(first: int, last: int) -> tuple[float, float, int]:
         top, bottom = max(first - radius, 0), min(last + radius, height)
@@ -129,8 +136,8 @@ def solve(problem: Problem, options: StvOptions | None = None, quality: bool = T
             solved = reference[:, inner]
         else:
             solved = np.empty((3, last - first, width), np.float32)
-            combine_patches(reference, scaled, equations, spatial, options.edge_sigma,
-                            options.ridge, first - top, solved)
+            combine_patches(reference, scaled, equations, spatial, edge, options.ridge,
+                            first - top, solved)
         length = np.empty((last - first, width), np.float32)
         confidence = np.empty((last - first, width), np.uint8)
         sums: tuple[float, float, int] = finish(
@@ -143,7 +150,8 @@ def solve(problem: Problem, options: StvOptions | None = None, quality: bool = T
         else:
             result.albedo[first:last] = length
         if quality:
-            assert result.confidence is not None and result.reason is not None
+            assert result.confidence is not None
+            assert result.reason is not None
             result.confidence[first:last] = confidence
             result.reason[first:last] = reason[inner]
         return sums
@@ -158,7 +166,7 @@ def plan(problem: Problem, options: StvOptions | None = None) -> Plan:
     """Fit the object's reflectance to sample pixels and choose how far to trust it.
 
     The choice compares how well each estimate predicts all frames of the samples, the rejected
-    ones included: mean of |difference| / mean intensity of the pixel, each at most 1.
+    ones included: |difference| / mean intensity of the pixel, its upper quartile.
     """
     options = options or StvOptions()
     lambertian = Plan(np.zeros(reflectance.TERMS), Trust.REJECTION)
@@ -176,20 +184,20 @@ def plan(problem: Problem, options: StvOptions | None = None) -> Plan:
         fitted = Plan(coefficients, Trust.REFLECTANCE)
         g = g_ls.copy()
         estimate_samples(u, d, h, usable, fitted.table, options.rounds, int(fitted.trust), g)
-    if options.trust is not None:
-        return Plan(coefficients, options.trust)
-    residual_ls = _misfit(u, d, h, g_ls, lambertian)
-    residual_first = _misfit(u, d, h, g_first, lambertian)
-    residual_fitted = _misfit(u, d, h, g, fitted)
+    misfit_ls = _misfit(u, d, h, g_ls, lambertian)
+    level = {
+        Trust.LEAST_SQUARES: np.quantile(misfit_ls, QUANTILE),
+        Trust.REJECTION: np.quantile(_misfit(u, d, h, g_first, lambertian), QUANTILE),
+        Trust.REFLECTANCE: np.quantile(_misfit(u, d, h, g, fitted), QUANTILE)}
     if problem.count >= MANY:
-        trusted = residual_fitted.mean() <= residual_first.mean()
-        return Plan(coefficients, Trust.REFLECTANCE if trusted else Trust.REJECTION)
-    if np.median(residual_ls) > NOT_LAMBERTIAN:
-        return Plan(coefficients, Trust.LEAST_SQUARES)
-    if residual_fitted.mean() <= residual_ls.mean():
-        return Plan(coefficients, Trust.REFLECTANCE)
-    better = residual_first.mean() <= residual_ls.mean()
-    return Plan(coefficients, Trust.REJECTION if better else Trust.LEAST_SQUARES)
+        trust = min(reversed(Trust), key=lambda choice: float(level[choice]))
+    elif np.median(misfit_ls) > NOT_LAMBERTIAN:
+        trust = Trust.LEAST_SQUARES
+    else:      # dropping frames always lowers the misfit of few; that alone must not count
+        trust = max(choice for choice in Trust if level[choice] <= level[Trust.LEAST_SQUARES])
+    if options.trust is not None:
+        trust = options.trust
+    return Plan(coefficients, trust, max(float(level[trust] * (4 / problem.count) ** 0.5), 1e-4))
 
 
 def _misfit(u: NDArray, d: NDArray, h: NDArray, g: NDArray, plan: Plan) -> NDArray:

@@ -244,9 +244,8 @@ def combine_patches(reference, scaled, equations, spatial, edge_sigma, ridge, fi
             for m in range(3):
                 b[m] = total[6 + m, x] + strength * reference[m, here, x]
             g[:] = 0
-            if g0[x] != 0 or g1[x] != 0 or g2[x] != 0:
-                if not solve3(a, b, g):
-                    g[0], g[1], g[2] = g0[x], g1[x], g2[x]
+            if (g0[x] != 0 or g1[x] != 0 or g2[x] != 0) and not solve3(a, b, g):
+                g[0], g[1], g[2] = g0[x], g1[x], g2[x]
             for m in range(3):
                 solved[m, y, x] = g[m]
 
@@ -274,7 +273,9 @@ def finish(solved, quality, mask, count, normal, albedo, confidence, reason):   
                     reason[y, x] |= np.uint8(FEW_LIGHTS)
                 continue
             length = np.sqrt(g0 * g0 + g1 * g1 + g2 * g2)
-            normal[y, x, 0], normal[y, x, 1], normal[y, x, 2] = g0 / length, g1 / length, g2 / length
+            normal[y, x, 0] = g0 / length
+            normal[y, x, 1] = g1 / length
+            normal[y, x, 2] = g2 / length
             albedo[y, x] = length
             squares += quality[0, y, x]
             brightness += quality[1, y, x]

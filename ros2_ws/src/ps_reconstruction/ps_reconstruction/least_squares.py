@@ -5,6 +5,8 @@ S is smooth, so M is computed at the grid nodes only and the kernel interpolates
 solving a 3 x 3 system per pixel; scale, flat field and (as one more frame) the ambient picture
 are folded into M. `solve_reference` is the same mathematics in plain NumPy.
 """
+from collections.abc import Sequence
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -76,16 +78,18 @@ def solve(problem: Problem, quality: bool = True, out: Solution | None = None) -
             albedo[rows][~mask] = np.nan
         if not quality:
             return 0.0, 0.0, 0
-        grey = np.tensordot(weights, scaled_normal, 1) if problem.colour else scaled_normal[0]
+        grey = _weighted(weights, scaled_normal)
         tally = np.zeros((4, last - first, width), np.float32)
         no_light = np.zeros_like(planes[0][0])
         for t, frame in enumerate(frames):
             if raw:
                 value, dark = frame, no_light if ambient is None else ambient
             else:
-                value = np.tensordot(weights, [plane[t] for plane in planes], 1)
+                value = _weighted(weights, [plane[t] for plane in planes])
                 dark = no_light
-            level = frame.max(axis=-1) if problem.colour else frame
+            level = frame
+            if problem.colour:
+                level = np.maximum(np.maximum(frame[..., 0], frame[..., 1]), frame[..., 2])
             _compare(value, dark, level, forward[t], problem.step, first,
                      np.float32(problem.saturation), grey, tally)
         assert result.confidence is not None
@@ -179,19 +183,36 @@ def _forward(problem: Problem, raw: bool) -> list[NDArray[np.float32]]:
     return [np.ascontiguousarray(both[:, :, t]) for t in range(problem.count)]
 
 
+def _weighted(weights: NDArray, planes: Sequence[NDArray] | NDArray) -> NDArray:
+    """Sum of planes by weights; the plane itself where there is one."""
+    total = planes[0] if len(planes) == 1 else planes[0] * weights[0]
+    for weight, plane in zip(weights[1:], planes[1:], strict=True):
+        total = total + plane * weight
+    return total
+
+
 def _normalised(problem: Problem, frames: list[NDArray], ambient: NDArray | None,
                 ) -> list[list[NDArray[np.float32]]]:
     """Scaled and clipped channels of a band: C lists of T planes (h, W) float32."""
     channels = 3 if problem.colour else 1
-    planes = np.empty((len(frames), channels, *frames[0].shape[:2]), np.float32)
+    shape = frames[0].shape[:2]
+    planes = np.empty((len(frames), channels, *shape), np.float32)
+    offset = np.zeros_like(frames[0]) if ambient is None else ambient
     for frame, scale, plane in zip(frames, problem.scale, planes, strict=True):
-        values = frame.reshape(*frame.shape[:2], channels).astype(np.float32)
-        if ambient is not None:
-            values -= ambient.reshape(values.shape)
-        values *= scale.astype(np.float32)
-        np.minimum(values, np.float32(problem.clip), out=values)
-        plane[...] = values.transpose(2, 0, 1)
+        _scale_rows(frame.reshape(*shape, channels), offset.reshape(*shape, channels),
+                    scale.astype(np.float32), np.float32(problem.clip), plane)
     return [list(planes[:, c]) for c in range(channels)]
+
+
+@numba.njit(nogil=True, cache=True, error_model='numpy')
+def _scale_rows(frame, ambient, scale, clip, out):    # type: ignore[no-untyped-def]
+    """Channels of one frame (h, W, C) apart, (C, h, W): ambient off, scaled, clipped."""
+    rows, width, channels = frame.shape
+    for y in range(rows):
+        for c in range(channels):
+            for x in range(width):
+                value = np.float32(frame[y, x, c]) - np.float32(ambient[y, x, c])
+                out[c, y, x] = min(value * scale[c], clip)
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')

@@ -22,6 +22,7 @@ from ps_reconstruction.surface import Roughness
 from ps_reconstruction.weighted_integration import integrate
 
 METHODS = ('ls', 'stv')
+WHOLE = 0.98                  # share of valid pixels from which the fast integration is right
 FORMS = ('auto', 'none', 'plane', 'slow')
 OUTPUTS = ('normal', 'slope', 'albedo', 'height', 'curvature', 'shape', 'confidence', 'preview',
            'roughness')
@@ -34,7 +35,8 @@ class Options:
     :param method: 'ls' or 'stv'.
     :param near_field: light vectors per pixel from the panel geometry.
     :param height_rounds: alternations of height and lighting, 0 for none.
-    :param careful: integrate with confidence weights and masks instead of by cosine transform.
+    :param careful: integrate with confidence weights and height steps. Else by cosine transform,
+        or over the valid pixels only where many are not.
     :param form: what is removed from the height: 'none', 'plane' (the one that fits best), 'slow'
         (all slow form; the picture's longer side / 16) or 'auto': 'slow' where the lights are
         assumed, so that their error is not taken for form, else 'none'.
@@ -211,6 +213,9 @@ def _integrate(result: Reconstruction, stack: Stack, rays: integration.Rays, opt
             if options.careful:
                 pitch = 1 / stack.camera.fx if stack.camera is not None else result.pixel_pitch
                 solver = partial(integrate, confidence=solution.confidence, pitch=pitch)
+            elif np.count_nonzero(result.mask) < WHOLE * result.mask.size:
+                # the cosine transform would pull the rim of a masked part down to flat ground
+                solver = partial(integrate, steepness=0.0, tolerance=1e-3)
             result.height = integration.height_from_normals(
                 result.normal, rays, plane.normal, plane.offset, solver)
             form = options.form

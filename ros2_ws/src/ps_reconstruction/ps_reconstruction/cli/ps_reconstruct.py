@@ -152,7 +152,9 @@ def write_result(result: Reconstruction, out: Path) -> None:
         if picture is None:
             continue
         bgr = picture[..., ::-1] if picture.ndim == 3 else picture
-        if not cv2.imwrite(str(out / f'{name}.png'), np.ascontiguousarray(bgr)):
+        # fast compression: the strong one takes longer than the reconstruction
+        if not cv2.imwrite(str(out / f'{name}.png'), np.ascontiguousarray(bgr),
+                           [cv2.IMWRITE_PNG_COMPRESSION, 1]):
             raise OSError(f'{out / name}.png cannot be written')
 
 

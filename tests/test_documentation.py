@@ -40,7 +40,7 @@ def declared_names() -> set[str]:
 
 
 def test_names_are_found_in_the_code():
-    assert {'stack', 'capture', 'head_driver/home', 'ring_calibration/save'} <= declared_names()
+    assert {'stack', 'capture', 'session/start', 'ring_calibration/save'} <= declared_names()
 
 
 @pytest.mark.parametrize('name', sorted(declared_names()))

@@ -77,6 +77,7 @@ def test_capture_to_published_slope(client: CellClient):
     normal = message_to_image(images['normal'])
     assert np.nanmax(normal[..., 2]) < 0           # visible surfaces face the camera
     truth = make_renderer('dome', load_head(nominal_head_path()), scale=SCALE).truth()
+    assert truth.height is not None
     error = angular_error_deg(optical_to_plane(normal), truth.normal)
     assert np.nanmedian(error) < 1.5
     slope = message_to_image(images['slope'])

@@ -2,6 +2,7 @@
 is shared with the light model under test.
 """
 from collections.abc import Callable
+import math
 import os
 from pathlib import Path
 
@@ -34,13 +35,13 @@ def camera() -> CameraGeometry:
 @pytest.fixture(scope='session')
 def ring() -> list[Light]:
     """The nominal head's bright-field panels at 40 degrees of tilt."""
-    lights, tilt = [], np.radians(40)
-    radius, z = 0.04 + 0.07 * np.cos(tilt), 0.15 - 0.07 * np.sin(tilt)
-    for panel, azimuth in zip(Panel, np.radians([0, 90, 180, 270]), strict=False):
-        c, s = np.cos(azimuth), np.sin(azimuth)
+    lights, tilt = [], math.radians(40)
+    radius, z = 0.04 + 0.07 * math.cos(tilt), 0.15 - 0.07 * math.sin(tilt)
+    for panel, azimuth in zip(Panel, (0, 90, 180, 270), strict=False):
+        c, s = math.cos(math.radians(azimuth)), math.sin(math.radians(azimuth))
         lights.append(Light(
             panel=panel, position=(radius * c, radius * s, z), right=(-s, c, 0.0),
-            axis=(-np.sin(tilt) * c, -np.sin(tilt) * s, -np.cos(tilt)), size=(0.06, 0.03)))
+            axis=(-math.sin(tilt) * c, -math.sin(tilt) * s, -math.cos(tilt)), size=(0.06, 0.03)))
     return lights
 
 

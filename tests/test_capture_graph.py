@@ -9,8 +9,11 @@ import pytest
 
 pytest.importorskip('ps_interfaces.msg', reason='needs the built workspace (make setup)')
 
+from rcl_interfaces.srv import SetParameters
 from rclpy.action import ActionClient
+from rclpy.parameter import Parameter
 
+from ps_head_driver import ros_support
 from ps_head_driver.conversions import message_to_image, message_to_stack
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.fake.renderer import make_renderer
@@ -226,6 +229,25 @@ def test_flat_field_is_used_for_its_illumination_only(client: CellClient):
     client.illuminate(0.06)
     client.call(srv.CaptureFlat, 'capture_flat', srv.CaptureFlat.Request(clear=True))
     assert client.stack(client.capture()).flat_id == ''
+
+
+@pytest.mark.parametrize(('node', 'name', 'value', 'accepted'), [
+    ('camera_sequencer', 'default_exposure', 0.003, True),
+    ('camera_sequencer', 'default_exposure', 99.0, False),
+    ('camera_sequencer', 'scene', 'plate', False),              # read at start only
+    ('reconstruction', 'method', 'guess', False),
+    ('reconstruction', 'smoothness', -1.0, False),
+    ('ring_calibration', 'head_serial', 'PS-1', True),
+])
+def test_parameter_change_works_or_says_why(client: CellClient, node, name, value, accepted):
+    kind = SetParameters
+    service = client.node.create_client(kind, f'{node}/set_parameters')
+    parameter = Parameter(name, value=value).to_parameter_msg()
+    result = ros_support.call(service, kind.Request(parameters=[parameter]), 10.0,
+                              ErrorCode.SEQUENCER_INTERNAL).results[0]
+    client.node.destroy_client(service)
+    assert result.successful == accepted, result.reason
+    assert accepted or len(result.reason) > 10
 
 
 def test_killed_reconstruction_comes_back_after_a_restart(cell: Cell, client: CellClient):

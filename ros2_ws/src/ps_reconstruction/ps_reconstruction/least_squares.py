@@ -26,6 +26,7 @@ from ps_reconstruction.problem import (
 )
 
 BAND = 8                      # rows per band: its accumulators stay in the second-level cache
+WIDE_BAND = 64                # where there are none
 GROUP = 4                     # frames per pass over the accumulators
 MAX_CONDITION = 1e3           # of the light matrix at any node; a usable ring has 1 to 10
 RESIDUAL_HALF = 0.05          # relative residual that halves the confidence
@@ -55,6 +56,9 @@ def solve(problem: Problem, quality: bool = True, out: Solution | None = None) -
             inverse = np.concatenate([inverse, -inverse.sum(axis=-1, keepdims=True)], axis=-1)
     groups = _grouped(inverse)
     forward = _forward(problem, raw)
+    # up to four frames: normals come out of the registers, nothing is accumulated in memory
+    fused = raw and len(groups) == 1
+    band = BAND if quality or not fused else WIDE_BAND
 
     def work(first: int, last: int) -> tuple[float, float, int]:
         rows = slice(first, last)
@@ -64,14 +68,21 @@ def solve(problem: Problem, quality: bool = True, out: Solution | None = None) -
             planes = [frames if ambient is None else [*frames, ambient]]
         else:
             planes = _normalised(problem, frames, ambient)
-        scaled_normal = np.zeros((channels, 3, last - first, width), np.float32)
+        scaled_normal = np.zeros(
+            (channels, 3, last - first, width) if quality or not fused else (1, 3, 0, 0),
+            np.float32)
         for c in range(channels):
             for i, group in enumerate(groups):
                 # the last group is filled up with a frame that counts nothing
                 f0, f1, f2, f3 = (
                     planes[c][min(GROUP * i + k, len(planes[c]) - 1)] for k in range(GROUP))
-                _accumulate(f0, f1, f2, f3, group, problem.step, first, scaled_normal[c])
-        _finish(scaled_normal, weights, result.normal[rows], albedo[rows])
+                if fused:
+                    _solve_rows(f0, f1, f2, f3, group, problem.step, first,
+                                result.normal[rows], result.albedo[rows], scaled_normal[0])
+                else:
+                    _accumulate(f0, f1, f2, f3, group, problem.step, first, scaled_normal[c])
+        if not fused:
+            _finish(scaled_normal, weights, result.normal[rows], albedo[rows])
         mask = None if problem.mask is None else problem.mask[rows]
         if mask is not None:
             result.normal[rows][~mask] = np.nan
@@ -101,7 +112,7 @@ def solve(problem: Problem, quality: bool = True, out: Solution | None = None) -
             result.reason[rows][~mask] = MASKED
         return squares, brightness, count
 
-    squares, brightness, count = np.sum(for_bands(height, BAND, work), axis=0)
+    squares, brightness, count = np.sum(for_bands(height, band, work), axis=0)
     if quality and problem.count > 3 and count and brightness > 0:
         result.residual_rms = float(np.sqrt(squares / count) / (brightness / count))
     return result
@@ -213,6 +224,58 @@ def _scale_rows(frame, ambient, scale, clip, out):    # type: ignore[no-untyped-
             for x in range(width):
                 value = np.float32(frame[y, x, c]) - np.float32(ambient[y, x, c])
                 out[c, y, x] = min(value * scale[c], clip)
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def _solve_rows(f0, f1, f2, f3, matrix, step, first,    # type: ignore[no-untyped-def]
+                normal, albedo, total):
+    """Unit normals and albedo of the rows from ``first`` from four frames in one pass.
+
+    :param matrix: (gh, gw, 3, 4) float32 at the nodes.
+    :param total: (3, h, W), gets the scaled normals; (3, 0, 0) if nobody wants them.
+    """
+    rows, width = f0.shape
+    nan, one, q = np.float32(np.nan), np.float32(1), np.float32(1) / np.float32(step)
+    m = np.empty((2, 12), np.float32)
+    # planes first, interleaving after: so the arithmetic is vectorised
+    planes = np.empty((3, step), np.float32)
+    px, py, pz = planes[0], planes[1], planes[2]
+    for y in range(rows):
+        i = (first + y) // step
+        fy = np.float32((first + y) - i * step) * q
+        for j in range((width - 1) // step + 1):
+            for side in range(2):
+                for a in range(3):
+                    for t in range(4):
+                        top = matrix[i, j + side, a, t]
+                        m[side, 4 * a + t] = top + fy * (matrix[i + 1, j + side, a, t] - top)
+            x0, x1, x2, x3, y0, y1, y2, y3, z0, z1, z2, z3 = m[0]
+            dx0, dx1, dx2, dx3, dy0, dy1, dy2, dy3, dz0, dz1, dz2, dz3 = (m[1] - m[0]) * q
+            begin, end = j * step, min((j + 1) * step, width)
+            c0, c1, c2, c3 = f0[y, begin:end], f1[y, begin:end], f2[y, begin:end], f3[y, begin:end]
+            length = albedo[y, begin:end]
+            for x in range(end - begin):
+                k = np.float32(x)
+                v0, v1 = np.float32(c0[x]), np.float32(c1[x])
+                v2, v3 = np.float32(c2[x]), np.float32(c3[x])
+                gx = ((x0 + k * dx0) * v0 + (x1 + k * dx1) * v1
+                      + (x2 + k * dx2) * v2 + (x3 + k * dx3) * v3)
+                gy = ((y0 + k * dy0) * v0 + (y1 + k * dy1) * v1
+                      + (y2 + k * dy2) * v2 + (y3 + k * dy3) * v3)
+                gz = ((z0 + k * dz0) * v0 + (z1 + k * dz1) * v1
+                      + (z2 + k * dz2) * v2 + (z3 + k * dz3) * v3)
+                g = np.sqrt(gx * gx + gy * gy + gz * gz)
+                g = g if gz > 0 else nan
+                inverse = one / g
+                px[x], py[x], pz[x] = gx * inverse, gy * inverse, gz * inverse
+                length[x] = g
+            row = normal[y, begin:end]
+            for x in range(end - begin):
+                row[x, 0], row[x, 1], row[x, 2] = px[x], py[x], pz[x]
+            if total.shape[1] > 0:
+                tx, ty, tz = total[0, y, begin:end], total[1, y, begin:end], total[2, y, begin:end]
+                for x in range(end - begin):
+                    tx[x], ty[x], tz[x] = px[x] * length[x], py[x] * length[x], pz[x] * length[x]
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')

@@ -255,7 +255,7 @@ def _tables(result: DemoResult) -> list[dict[str, Any]]:
 
     tables = [
         {'caption': 'Setting', 'rows': [(k, text(v)) for k, v in result.setting.items()]},
-        {'caption': 'Times', 'rows': [
+        {'caption': 'Times, first stack after the start', 'rows': [
             (k, f'{v * 1e3:.1f} ms') for k, v in result.timings_s.items()]}]
     quality = [('valid pixels', f'{result.valid_fraction:.1%}'),
                ('residual, relative', f'{result.residual_rms:.2%}')]

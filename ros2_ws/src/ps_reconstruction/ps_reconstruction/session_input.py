@@ -1,9 +1,12 @@
 """Stacks out of a recorded session (MCAP), for ps_reconstruct."""
 from collections.abc import Iterator
 from pathlib import Path
+import struct
 
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.stack import Stack
+
+STACK_TYPE = 'ps_interfaces/msg/PhotometricStack'
 
 
 def session_file(path: Path) -> Path | None:
@@ -21,22 +24,31 @@ def read_session(path: Path) -> Iterator[Stack]:
     :raises PsError: SESSION_NOT_A_SESSION if there is no stack or the file is damaged.
     """
     from mcap.exceptions import McapError
-    from mcap.reader import NonSeekingReader
+    from mcap.records import Channel, Message, Schema
+    from mcap.stream_reader import StreamReader
     from rclpy.serialization import deserialize_message
 
     from ps_head_driver.conversions import message_to_stack
     from ps_interfaces.msg import PhotometricStack
     found = 0
+    schemas: set[int] = set()
+    channels: set[int] = set()
     with path.open('rb') as stream:
         try:
-            for schema, _, message in NonSeekingReader(stream).iter_messages(
-                    log_time_order=False):
-                if schema is not None and schema.name == 'ps_interfaces/msg/PhotometricStack':
+            # record by record: the index at the end is missing after a crash
+            for record in StreamReader(stream).records:
+                if isinstance(record, Schema) and record.name == STACK_TYPE:
+                    schemas.add(record.id)
+                elif isinstance(record, Channel) and record.schema_id in schemas:
+                    channels.add(record.id)
+                elif isinstance(record, Message) and record.channel_id in channels:
                     found += 1
-                    yield message_to_stack(deserialize_message(message.data, PhotometricStack))
-        except (McapError, EOFError, ValueError) as error:
+                    yield message_to_stack(deserialize_message(record.data, PhotometricStack))
+        except (McapError, EOFError, ValueError, struct.error) as error:
             # a session that was cut off is good up to there
             if not found:
-                raise PsError(ErrorCode.SESSION_NOT_A_SESSION, f'{path}: {error}') from error
+                raise PsError(ErrorCode.SESSION_NOT_A_SESSION,
+                              f'{path}: damaged before its first stack: '
+                              f'{str(error) or type(error).__name__}') from error
     if not found:
         raise PsError(ErrorCode.SESSION_NOT_A_SESSION, f'{path}: no stack was recorded')

@@ -101,8 +101,8 @@ def relief(
     weight = local_sum(trust) + np.float32(1e-6)
     for weighted in (flat_u, flat_v):
         mean = np.asarray(cv2.resize(local_sum(weighted) / weight, du.shape[::-1],
-                                     interpolation=cv2.INTER_LINEAR))
-        mean *= trust
+                                     interpolation=cv2.INTER_LINEAR), np.float32)
+        np.multiply(mean, trust, out=mean)
         weighted -= mean
     return solve_poisson(divergence(flat_u, flat_v), short_px, pole_px=long_px)
 

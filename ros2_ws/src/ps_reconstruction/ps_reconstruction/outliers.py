@@ -1,7 +1,4 @@
-"""Which frames of one pixel to believe: the temporal weights of the robust regression.
-
-Everything here looks at one pixel: u_t intensity per irradiance, d_t unit vector to the light, h_t
-unit half-vector between light and view. Lambert's law reads u_t = g . d_t.
+"""Which frames of a pixel to believe: the temporal weights of the robust regression.
 
 Many lights (T >= MANY): start from the middle ranks of the intensities; then, three times, call a
 frame shadowed where the prediction or the observation is too dark, and of the rest believe the
@@ -10,141 +7,301 @@ Few lights: the residual alone cannot tell a highlight from the attached shadow 
 frames that are dark against the brightest (attached shadow), then the frame whose half-vector
 comes closest to the normal, if that is close and the frame is too bright (highlight).
 `refine` then repeats the rejection against the object's own reflectance (reflectance.py).
+
+CHUNK pixels are worked on together. Their numbers lie in flat float32 buffers, quantity after
+quantity at the constant offsets below: with these and without branches, the compiler sees that
+the loops over pixels can use vector instructions. Weights are 0 for a frame not believed.
 """
 import numba
 import numpy as np
 
-from ps_reconstruction.reflectance import LEAST_HALF, add_equation, look_up, solve3
+from ps_reconstruction.reflectance import LEAST_HALF, departure
 
 MANY = 8                                  # lights, from which on ranks tell more than thresholds
 RANKS = (0.3, 0.8)                        # of the first estimate with many lights
 BELIEVED = 0.6                            # fraction of the lit frames kept, the darkest
+LEAST_KEPT = 4
 LEAST_COSINE = 0.1                        # to a light; below it a frame counts as shadowed
 LEAST_RATIO, MOST_RATIO = 0.6, 1.5        # observation over prediction
 DARK_RATIO = 0.1                          # of the brightest frame; darker is an attached shadow
 GATE = float(np.cos(np.radians(25)))      # half-vector against normal: there gloss shows
 HUBER = 0.02                              # threshold of the residual, relative to |g|
+SINGULAR = 1e-7                           # determinant over cubed trace
+FAST = {'contract', 'reassoc', 'arcp', 'nsz', 'afn'}    # without nnan: NaN marks invalid pixels
+
+CHUNK = 64
+# Buffer of a frame, (FRAME_SIZE,): intensity per irradiance; irradiance; unit vector to the light;
+# unit half-vector between light and view; 1 if usable; weight; f / (n.l). Lambert: U = g . D
+U, E = 0, CHUNK
+D0, D1, D2 = 2 * CHUNK, 3 * CHUNK, 4 * CHUNK
+H0, H1, H2 = 5 * CHUNK, 6 * CHUNK, 7 * CHUNK
+USABLE, WEIGHT, FACTOR = 8 * CHUNK, 9 * CHUNK, 10 * CHUNK
+FRAME_SIZE = 11 * CHUNK
+# Buffer of the pixels, (PIXEL_SIZE,): scaled normal, its length and 1 / length; scratch
+G0, G1, G2, LENGTH, INVERSE = 0, CHUNK, 2 * CHUNK, 3 * CHUNK, 4 * CHUNK
+LEFT, BEST, PLACE = 5 * CHUNK, 6 * CHUNK, 7 * CHUNK
+PIXEL_SIZE = 8 * CHUNK
+# Buffer of the normal equations, (EQUATION_SIZE,): xx xy xz yy yz zz, right side
+EQUATION_SIZE = 9 * CHUNK
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def add_equations(frame, equations):    # type: ignore[no-untyped-def]
+    """Add the weighted equations U = FACTOR D . g of one frame."""
+    for x in range(CHUNK):
+        f = frame[FACTOR + x]
+        w = frame[WEIGHT + x] * f
+        value = frame[U + x] * w
+        w *= f
+        d0, d1, d2 = frame[D0 + x], frame[D1 + x], frame[D2 + x]
+        w0, w1, w2 = w * d0, w * d1, w * d2
+        equations[x] += w0 * d0
+        equations[CHUNK + x] += w0 * d1
+        equations[2 * CHUNK + x] += w0 * d2
+        equations[3 * CHUNK + x] += w1 * d1
+        equations[4 * CHUNK + x] += w1 * d2
+        equations[5 * CHUNK + x] += w2 * d2
+        equations[6 * CHUNK + x] += value * d0
+        equations[7 * CHUNK + x] += value * d1
+        equations[8 * CHUNK + x] += value * d2
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def solve_equations(equations, pixels):    # type: ignore[no-untyped-def]
+    """Scaled normals by Cramer's rule; where the equations are singular they stay as they are."""
+    one = np.float32(1)
+    for x in range(CHUNK):
+        xx, xy, xz = equations[x], equations[CHUNK + x], equations[2 * CHUNK + x]
+        yy, yz, zz = (equations[3 * CHUNK + x], equations[4 * CHUNK + x],
+                      equations[5 * CHUNK + x])
+        b0, b1, b2 = (equations[6 * CHUNK + x], equations[7 * CHUNK + x],
+                      equations[8 * CHUNK + x])
+        c0, c1, c2 = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+        c3, c4, c5 = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+        determinant = xx * c0 + xy * c1 + xz * c2
+        trace = xx + yy + zz
+        good = determinant > np.float32(SINGULAR) * trace * trace * trace
+        inverse = one / (determinant if good else one)
+        old0, old1, old2 = pixels[G0 + x], pixels[G1 + x], pixels[G2 + x]
+        g0 = (c0 * b0 + c1 * b1 + c2 * b2) * inverse if good else old0
+        g1 = (c1 * b0 + c3 * b1 + c4 * b2) * inverse if good else old1
+        g2 = (c2 * b0 + c4 * b1 + c5 * b2) * inverse if good else old2
+        length = np.sqrt(g0 * g0 + g1 * g1 + g2 * g2)
+        pixels[G0 + x], pixels[G1 + x], pixels[G2 + x] = g0, g1, g2
+        pixels[LENGTH + x] = length
+        pixels[INVERSE + x] = one / max(length, np.float32(1e-30))
 
 
 @numba.njit(nogil=True, cache=True)
-def least_squares(u, d, weight, g):    # type: ignore[no-untyped-def]
-    """Weighted least squares u_t = g . d_t; False (g untouched) if it is not determined."""
-    a, b = np.zeros(6, np.float32), np.zeros(3, np.float32)
-    for t in range(u.size):
-        if weight[t] > 0:
-            add_equation(a, b, d[t], weight[t], u[t])
-    return solve3(a, b, g)
+def solve_frames(frames, equations, pixels):    # type: ignore[no-untyped-def]
+    """Weighted least squares over all frames (T, FRAME_SIZE)."""
+    equations[:] = 0
+    for t in range(frames.shape[0]):
+        add_equations(frames[t], equations)
+    solve_equations(equations, pixels)
 
 
 @numba.njit(nogil=True, cache=True)
-def keep_darkest(u, weight, fraction):    # type: ignore[no-untyped-def]
-    """Set the weight of all but the darkest ``fraction`` (at least 4) of the used frames to 0."""
-    used = np.sort(u[weight > 0])
-    if used.size > 4:
-        limit = used[min(max(4, int(fraction * used.size + 0.5)), used.size) - 1]
-        for t in range(u.size):
-            if u[t] > limit:
-                weight[t] = 0
-
-
-@numba.njit(nogil=True, cache=True)
-def first_of_many(u, d, usable, weight, g):    # type: ignore[no-untyped-def]
-    """First estimate from many lights; fills weight (T,) with 0 or 1 and g (3,)."""
-    order = np.argsort(u)
-    last = u.size - 1
-    weight[:] = 0
-    for rank in range(u.size):
-        t = order[rank]
-        if usable[t] and RANKS[0] * last < rank < RANKS[1] * last:
-            weight[t] = 1
-    if not least_squares(u, d, weight, g):
-        return
-    for _ in range(3):
-        length = np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
-        for t in range(u.size):
-            predicted = g[0] * d[t, 0] + g[1] * d[t, 1] + g[2] * d[t, 2]
-            weight[t] = 1 if (usable[t] and predicted > LEAST_COSINE * length
-                              and u[t] > LEAST_RATIO * predicted) else 0
-        keep_darkest(u, weight, BELIEVED)
-        if not least_squares(u, d, weight, g):
-            return
-
-
-@numba.njit(nogil=True, cache=True)
-def first_of_few(u, d, h, usable, weight, g):    # type: ignore[no-untyped-def]
-    """First estimate from few lights; fills weight (T,) with 0 or 1 and g (3,)."""
-    count = u.size
-    brightest = np.float32(0)
-    left = 0
-    for t in range(count):
-        weight[t] = 1 if usable[t] else 0
-        left += 1 if usable[t] else 0
-        brightest = max(brightest, u[t])
-    while left > 3:
-        darkest = -1
-        for t in range(count):
-            if weight[t] > 0 and u[t] < DARK_RATIO * brightest and (
-                    darkest < 0 or u[t] < u[darkest]):
-                darkest = t
-        if darkest < 0:
-            break
-        weight[darkest] = 0
-        left -= 1
-    if not least_squares(u, d, weight, g) or left < 4:
-        return
-    length = np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
-    nearest, best = -1, np.float32(GATE) * length
-    for t in range(count):
-        cosine = g[0] * h[t, 0] + g[1] * h[t, 1] + g[2] * h[t, 2]
-        if weight[t] > 0 and cosine > best:
-            nearest, best = t, cosine
-    if nearest < 0:
-        return
-    predicted = g[0] * d[nearest, 0] + g[1] * d[nearest, 1] + g[2] * d[nearest, 2]
-    if u[nearest] > predicted:
-        weight[nearest] = 0
-        if not least_squares(u, d, weight, g):
-            weight[nearest] = 1
-
-
-@numba.njit(nogil=True, cache=True)
-def refine(u, d, h, usable, table, rounds, g, weight, factor):    # type: ignore[no-untyped-def]
-    """Repeat rejection, Huber weights and solution against the object's reflectance.
-
-    :param table: of reflectance.tabulate.
-    :param g: (3,) estimate in, better estimate out.
-    :param weight: (T,) out: w_temp times the Huber weight.
-    :param factor: (T,) out: f / (n.l), so that u_t = factor_t d_t . g.
-    """
-    count = u.size
-    many = count >= MANY
-    a, b, x = np.empty(6, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
-    for _ in range(rounds):
-        length = np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
-        if not length > 0:
-            return
+def keep_darkest(frames):    # type: ignore[no-untyped-def]
+    """Set the weight of all but the darkest frames used of each pixel to 0."""
+    values = np.empty(frames.shape[0], np.float32)
+    for x in range(CHUNK):
         used = 0
-        for t in range(count):
-            weight[t], factor[t] = 0, 1
-            cosine = (g[0] * d[t, 0] + g[1] * d[t, 1] + g[2] * d[t, 2]) / length
-            half = (g[0] * h[t, 0] + g[1] * h[t, 1] + g[2] * h[t, 2]) / length
-            if not usable[t] or cosine < LEAST_COSINE or half < LEAST_HALF:
-                continue
-            factor[t] = look_up(table, min(cosine, np.float32(1)), min(half, np.float32(1)))
-            predicted = factor[t] * cosine * length
-            if LEAST_RATIO * predicted < u[t] < MOST_RATIO * predicted:
-                size = abs(u[t] - predicted)
-                limit = np.float32(HUBER) * length
-                weight[t] = 1 if size < limit else limit / size
+        for t in range(frames.shape[0]):
+            if frames[t, WEIGHT + x] > 0:
+                values[used] = frames[t, U + x]
                 used += 1
-        if many:
-            keep_darkest(u, weight, BELIEVED)
-        if used < 3:
-            return
-        a[:], b[:] = 0, 0
+        if used <= LEAST_KEPT:
+            continue
+        kept = max(LEAST_KEPT, int(BELIEVED * used + 0.5))
+        limit = np.sort(values[:used])[kept - 1]
+        for t in range(frames.shape[0]):
+            if frames[t, U + x] > limit:
+                frames[t, WEIGHT + x] = 0
+
+
+@numba.njit(nogil=True, cache=True)
+def middle_ranks(frames):    # type: ignore[no-untyped-def]
+    """Weight 1 for the usable frames of middle rank of each pixel."""
+    last = frames.shape[0] - 1
+    for x in range(CHUNK):
+        order = np.argsort(frames[:, U + x])
+        for rank in range(frames.shape[0]):
+            inside = RANKS[0] * last < rank < RANKS[1] * last
+            t = order[rank]
+            frames[t, WEIGHT + x] = frames[t, USABLE + x] if inside else np.float32(0)
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def believe_lit(frame, pixels):    # type: ignore[no-untyped-def]
+    """Weight 1 where a frame is usable and neither prediction nor observation is too dark."""
+    for x in range(CHUNK):
+        predicted = (pixels[G0 + x] * frame[D0 + x] + pixels[G1 + x] * frame[D1 + x]
+                     + pixels[G2 + x] * frame[D2 + x])
+        lit = ((predicted > np.float32(LEAST_COSINE) * pixels[LENGTH + x])
+               & (frame[U + x] > np.float32(LEAST_RATIO) * predicted))
+        usable = frame[USABLE + x]
+        frame[WEIGHT + x] = usable if lit else np.float32(0)
+
+
+@numba.njit(nogil=True, cache=True)
+def first_of_many(frames, equations, pixels):    # type: ignore[no-untyped-def]
+    """First estimate from many lights: weights 0 or 1 and scaled normals."""
+    middle_ranks(frames)
+    solve_frames(frames, equations, pixels)
+    for _ in range(3):
+        for t in range(frames.shape[0]):
+            believe_lit(frames[t], pixels)
+        keep_darkest(frames)
+        solve_frames(frames, equations, pixels)
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def _find_dark(frame, index, pixels):    # type: ignore[no-untyped-def]
+    """Note this frame as PLACE where it is believed and darker than BEST."""
+    for x in range(CHUNK):
+        best, place, value = pixels[BEST + x], pixels[PLACE + x], frame[U + x]
+        darker = ((frame[WEIGHT + x] > np.float32(0)) & (value < best)
+                  & (pixels[LEFT + x] > np.float32(3)))
+        pixels[BEST + x] = value if darker else best
+        pixels[PLACE + x] = index if darker else place
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def _find_glossy(frame, index, pixels):    # type: ignore[no-untyped-def]
+    """Note this frame as PLACE where it is believed and its half-vector nearer than BEST."""
+    for x in range(CHUNK):
+        best, place = pixels[BEST + x], pixels[PLACE + x]
+        cosine = (pixels[G0 + x] * frame[H0 + x] + pixels[G1 + x] * frame[H1 + x]
+                  + pixels[G2 + x] * frame[H2 + x])
+        nearer = (frame[WEIGHT + x] > np.float32(0)) & (cosine > best)
+        pixels[BEST + x] = cosine if nearer else best
+        pixels[PLACE + x] = index if nearer else place
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def _drop_place(frame, index, pixels, only_bright):    # type: ignore[no-untyped-def]
+    """Drop this frame where it is PLACE; if ``only_bright``, only where it exceeds Lambert."""
+    for x in range(CHUNK):
+        predicted = (pixels[G0 + x] * frame[D0 + x] + pixels[G1 + x] * frame[D1 + x]
+                     + pixels[G2 + x] * frame[D2 + x])
+        limit = predicted if only_bright else np.float32(-1e30)
+        weight = frame[WEIGHT + x]
+        drop = (pixels[PLACE + x] == index) & (frame[U + x] > limit)
+        frame[WEIGHT + x] = np.float32(0) if drop else weight
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def first_of_few(frames, equations, pixels):    # type: ignore[no-untyped-def]
+    """First estimate from few lights: weights 0 or 1 and scaled normals."""
+    count = frames.shape[0]
+    zero, one = np.float32(0), np.float32(1)
+    brightest = np.zeros(CHUNK, np.float32)
+    pixels[LEFT:LEFT + CHUNK] = 0
+    for t in range(count):
+        frame = frames[t]
+        for x in range(CHUNK):
+            frame[WEIGHT + x] = frame[USABLE + x]
+            pixels[LEFT + x] += frame[USABLE + x]
+            brightest[x] = max(brightest[x], frame[U + x])
+    for _ in range(count - 3):                      # the darkest, then the next darkest, ...
+        for x in range(CHUNK):
+            pixels[BEST + x] = np.float32(DARK_RATIO) * brightest[x]
+            pixels[PLACE + x] = -one
         for t in range(count):
-            if weight[t] > 0:
-                add_equation(a, b, d[t], weight[t] * factor[t] * factor[t], u[t] / factor[t])
-        if not solve3(a, b, x):
-            return
-        g[:] = x
+            _find_dark(frames[t], np.float32(t), pixels)
+        for t in range(count):
+            _drop_place(frames[t], np.float32(t), pixels, False)
+        for x in range(CHUNK):
+            pixels[LEFT + x] -= one if pixels[PLACE + x] >= zero else zero
+    solve_frames(frames, equations, pixels)
+    for x in range(CHUNK):
+        enough = pixels[LEFT + x] > np.float32(3)
+        gate = np.float32(GATE) * pixels[LENGTH + x]
+        pixels[BEST + x] = gate if enough else np.float32(1e30)
+        pixels[PLACE + x] = -one
+    for t in range(count):
+        _find_glossy(frames[t], np.float32(t), pixels)
+    for t in range(count):
+        _drop_place(frames[t], np.float32(t), pixels, True)
+    solve_frames(frames, equations, pixels)
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def reject(frame, coefficients, pixels):    # type: ignore[no-untyped-def]
+    """Weight (w_temp times Huber) and reflectance factor of one frame for the present g."""
+    zero, one = np.float32(0), np.float32(1)
+    least_cosine, least_half = np.float32(LEAST_COSINE), np.float32(LEAST_HALF)
+    for x in range(CHUNK):
+        g0, g1, g2 = pixels[G0 + x], pixels[G1 + x], pixels[G2 + x]
+        length, inverse = pixels[LENGTH + x], pixels[INVERSE + x]
+        cosine = (g0 * frame[D0 + x] + g1 * frame[D1 + x] + g2 * frame[D2 + x]) * inverse
+        half = (g0 * frame[H0 + x] + g1 * frame[H1 + x] + g2 * frame[H2 + x]) * inverse
+        f = departure(coefficients, min(max(cosine, least_cosine), one),
+                      min(max(half, least_half), one))
+        value, usable = frame[U + x], frame[USABLE + x]
+        predicted = f * cosine * length
+        fits = ((cosine >= least_cosine) & (half >= least_half)
+                & (value > np.float32(LEAST_RATIO) * predicted)
+                & (value < np.float32(MOST_RATIO) * predicted))
+        limit = np.float32(HUBER) * length
+        weight = usable * limit / max(abs(value - predicted), limit)
+        frame[WEIGHT + x] = weight if fits else zero
+        frame[FACTOR + x] = f
+
+
+@numba.njit(nogil=True, cache=True)
+def refine(frames, coefficients, rounds, equations, pixels):    # type: ignore[no-untyped-def]
+    """Repeat rejection, Huber weights and solution against the object's reflectance."""
+    for _ in range(rounds):
+        for t in range(frames.shape[0]):
+            reject(frames[t], coefficients, pixels)
+        if frames.shape[0] >= MANY:
+            keep_darkest(frames)
+        solve_frames(frames, equations, pixels)
+
+
+@numba.njit(nogil=True, cache=True)
+def estimate(frames, coefficients, rounds, rejecting, reflecting, equations, pixels):    # type: ignore[no-untyped-def]
+    """Robust scaled normals of a chunk: ``pixels`` hold LS on entry and the estimate on return.
+
+    :param frames: (T, FRAME_SIZE), U to USABLE filled; returns WEIGHT and FACTOR.
+    :param coefficients: (10,) float32 of the reflectance, for ``reflecting``.
+    """
+    for t in range(frames.shape[0]):
+        frames[t, WEIGHT:WEIGHT + CHUNK] = 1
+        frames[t, FACTOR:FACTOR + CHUNK] = 1
+    if not rejecting:
+        return
+    if frames.shape[0] >= MANY:
+        first_of_many(frames, equations, pixels)
+    else:
+        first_of_few(frames, equations, pixels)
+        for t in range(frames.shape[0]):         # what the first test dropped stays dropped
+            for x in range(CHUNK):
+                frames[t, USABLE + x] = frames[t, WEIGHT + x]
+    if reflecting:
+        refine(frames, coefficients, rounds, equations, pixels)
+
+
+@numba.njit(nogil=True, cache=True)
+def estimate_samples(u, d, h, usable, coefficients, rounds, rejecting, reflecting, g):    # type: ignore[no-untyped-def]
+    """`estimate` for planes: u, usable (T, P), d, h (T, 3, P), g (3, P) in and out."""
+    count, samples = u.shape
+    frames = np.empty((count, FRAME_SIZE), np.float32)
+    equations, pixels = np.empty(EQUATION_SIZE, np.float32), np.empty(PIXEL_SIZE, np.float32)
+    for begin in range(0, samples, CHUNK):
+        for x in range(CHUNK):
+            p = min(begin + x, samples - 1)
+            for t in range(count):
+                frame = frames[t]
+                frame[U + x], frame[USABLE + x], frame[E + x] = u[t, p], usable[t, p], 1
+                for m in range(3):
+                    frame[D0 + m * CHUNK + x] = d[t, m, p]
+                    frame[H0 + m * CHUNK + x] = h[t, m, p]
+            for m in range(3):
+                pixels[m * CHUNK + x] = g[m, p]
+        estimate(frames, coefficients, rounds, rejecting, reflecting, equations, pixels)
+        for x in range(min(CHUNK, samples - begin)):
+            for m in range(3):
+                g[m, begin + x] = pixels[m * CHUNK + x]

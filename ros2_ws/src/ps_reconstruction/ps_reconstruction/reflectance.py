@@ -6,9 +6,9 @@ The robust solver predicts the intensity per irradiance of a pixel as
 
 n.l the cosine to the light, n.h the cosine to the half-vector between light and view. The basis is
 low order: six polynomials for the body reflection (drop-off at grazing light, forward and backward
-scattering) and four exponential lobes of the half-vector for gloss. The ten coefficients belong to
-the object, so thousands of pixels determine them: the scaled normals are eliminated pixel by pixel
-(variable projection) and what the lights of a pixel cannot explain by any normal is fitted.
+scattering) and four lobes of the half-vector, shaped like a GGX distribution, for gloss. The ten
+coefficients belong to the object, so thousands of pixels determine them: the scaled normals are
+eliminated pixel by pixel (variable projection) and what no normal can explain is fitted.
 Lambert's law is c = 0.
 
 Bi-polynomial reflectance: Shi et al., "Bi-polynomial modeling of low-frequency reflectances",
@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 TERMS = 10
-LOBES = (0.004, 0.02, 0.06, 0.2)     # widths of the gloss lobes, tan^2 of the half angle
-NODES = 64                           # of the table, per axis
+LOBES = (0.004, 0.02, 0.06, 0.2)     # squared roughness of the gloss lobes
+LEAST_FACTOR = 0.05                  # of f / (n.l)
 LEAST_HALF = 0.05                    # cosine to the half-vector below which nothing is predicted
 RIDGE = 1e-3                         # of the coefficients, relative to the mean information
 
@@ -33,51 +33,34 @@ def fill_basis(x, h, out):    # type: ignore[no-untyped-def]
     out[3], out[4], out[5] = x * v, x * v * v, x * u * v
     tangent = (1.0 - h * h) / (h * h)
     for k in range(len(LOBES)):
-        out[6 + k] = np.exp(-tangent / LOBES[k])
-
-
-@numba.njit(nogil=True, cache=True)
-def tabulate(coefficients):    # type: ignore[no-untyped-def]
-    """F / (n.l) at the nodes x = i / (NODES - 1), h = 1 - (j / (NODES - 1))^2, float32.
-
-    The half-vector axis is finer near h = 1, where gloss changes fastest. x starts at half a
-    node, because gloss divided by n.l has no limit at grazing light.
-    """
-    table = np.empty((NODES, NODES), np.float32)
-    basis = np.empty(TERMS)
-    for i in range(NODES):
-        x = max(i, 0.5) / (NODES - 1)
-        for j in range(NODES):
-            h = max(1.0 - (j / (NODES - 1)) ** 2, LEAST_HALF)
-            fill_basis(x, h, basis)
-            total = x
-            for k in range(TERMS):
-                total += coefficients[k] * basis[k]
-            table[i, j] = max(total / x, 0.05)
-    return table
+        out[6 + k] = 1.0 / (1.0 + tangent / LOBES[k]) ** 2
 
 
 @numba.njit(nogil=True, cache=True, inline='always')
-def look_up(table, x, h):    # type: ignore[no-untyped-def]
-    """F / (n.l) by bilinear interpolation; 0 <= x, h <= 1."""
-    row = x * np.float32(NODES - 1)
-    column = np.sqrt(np.float32(1) - h) * np.float32(NODES - 1)
-    i = min(int(row), NODES - 2)
-    j = min(int(column), NODES - 2)
-    fy, fx = row - np.float32(i), column - np.float32(j)
-    top = table[i, j] + fx * (table[i, j + 1] - table[i, j])
-    low = table[i + 1, j] + fx * (table[i + 1, j + 1] - table[i + 1, j])
-    return top + fy * (low - top)
+def departure(coefficients, x, h):    # type: ignore[no-untyped-def]
+    """F / (n.l), at least LEAST_FACTOR; float32 and free of branches, for vectorised loops."""
+    one = np.float32(1)
+    u, v = one - x, one - h
+    square = h * h
+    tangent = (one - square) / square
+    body = (coefficients[0] + u * (coefficients[1] + u * coefficients[2])) * u + (
+        coefficients[3] + coefficients[4] * v + coefficients[5] * u) * v
+    gloss = np.float32(0)
+    for k in range(len(LOBES)):
+        inverse = one / (one + tangent * np.float32(1 / LOBES[k]))
+        gloss += coefficients[6 + k] * inverse * inverse
+    return max(one + body + gloss / x, np.float32(LEAST_FACTOR))
 
 
-@numba.njit(nogil=True, cache=True)
-def look_up_all(table, x, h):    # type: ignore[no-untyped-def]
-    """`look_up` for arrays (P, T)."""
-    result = np.empty(x.shape, np.float32)
-    for p in range(x.shape[0]):
-        for t in range(x.shape[1]):
-            result[p, t] = look_up(table, np.float32(x[p, t]), np.float32(h[p, t]))
-    return result
+def departures(coefficients: NDArray, x: NDArray, h: NDArray) -> NDArray:
+    """F / (n.l) in plain NumPy, for samples and oracles; x > 0."""
+    tangent = 1 / h ** 2 - 1
+    u, v = 1 - x, 1 - h
+    c = coefficients
+    gloss = sum(c[6 + k] / (1 + tangent / LOBES[k]) ** 2 for k in range(len(LOBES)))
+    factor = (1 + c[0] * u + c[1] * u ** 2 + c[2] * u ** 3 + c[3] * v + c[4] * v ** 2
+              + c[5] * u * v + gloss / x)
+    return np.maximum(factor, LEAST_FACTOR)
 
 
 @numba.njit(nogil=True, cache=True)
@@ -123,14 +106,14 @@ def normal_equations(values, directions, halves, usable, scaled_normals, coeffic
                      darkest, low, high, huber):    # type: ignore[no-untyped-def]
     """Information matrix (10, 10) and right side (10,) for a step of the coefficients.
 
-    :param values: (P, T) intensity per irradiance of sample pixels.
-    :param directions: (P, T, 3) unit vectors to the lights; halves: (P, T, 3) unit half-vectors.
-    :param usable: (P, T) bool, frames that may be used.
-    :param scaled_normals: (P, 3).
+    :param values: (T, P) intensity per irradiance of sample pixels.
+    :param directions: (T, 3, P) unit vectors to the lights; halves: (T, 3, P) unit half-vectors.
+    :param usable: (T, P), 0 for frames that must not be used.
+    :param scaled_normals: (3, P).
     :param darkest: least n.l; low, high: limits of value over prediction; huber: threshold on the
         residual relative to |g|.
     """
-    pixels, count = values.shape
+    count, pixels = values.shape
     information, right = np.zeros((TERMS, TERMS)), np.zeros(TERMS)
     terms = np.empty((count, TERMS))
     jacobian = np.empty((count, 3))
@@ -138,7 +121,7 @@ def normal_equations(values, directions, halves, usable, scaled_normals, coeffic
     a, b, x = np.empty(6), np.empty(3), np.empty(3)
     cross, projection, column = np.empty((3, TERMS)), np.empty((3, TERMS)), np.empty(3)
     for p in range(pixels):
-        g = scaled_normals[p]
+        g = scaled_normals[:, p]
         length = np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
         if not length > 0:
             continue
@@ -146,16 +129,16 @@ def normal_equations(values, directions, halves, usable, scaled_normals, coeffic
         used = 0
         for t in range(count):
             weight[t] = 0
-            d, e = directions[p, t], halves[p, t]
+            d, e = directions[t, :, p], halves[t, :, p]
             cosine = (g[0] * d[0] + g[1] * d[1] + g[2] * d[2]) / length
             half = (g[0] * e[0] + g[1] * e[1] + g[2] * e[2]) / length
-            if not usable[p, t] or cosine < darkest or half < LEAST_HALF:
+            if not usable[t, p] or cosine < darkest or half < LEAST_HALF:
                 continue
             fill_basis(cosine, half, terms[t])
             predicted = cosine
             for k in range(TERMS):
                 predicted += coefficients[k] * terms[t, k]
-            value = values[p, t] / length
+            value = values[t, p] / length
             if value < low * predicted or value > high * predicted:
                 continue
             residual[t] = value - predicted

@@ -25,9 +25,16 @@ from ps_head_driver.errors import ErrorCode, PsError
 from ps_reconstruction import reflectance
 from ps_reconstruction.bands import for_bands
 from ps_reconstruction.least_squares import check_lights, empty_solution
-from ps_reconstruction.outliers import HUBER, LEAST_COSINE, LEAST_RATIO, MANY, MOST_RATIO
+from ps_reconstruction.outliers import (
+    HUBER,
+    LEAST_COSINE,
+    LEAST_RATIO,
+    MANY,
+    MOST_RATIO,
+    estimate_samples,
+)
 from ps_reconstruction.problem import GREY_WEIGHTS, Problem, Solution
-from ps_reconstruction.stv_kernels import combine_patches, estimate_samples, finish, solve_pixels
+from ps_reconstruction.stv_kernels import MAX_PATCH, combine_patches, finish, solve_pixels
 
 BAND = 16                     # rows per band
 SAMPLES = 4000                # pixels that the plan looks at
@@ -65,9 +72,9 @@ class StvOptions:
     trust: Trust | None = None
 
     def __post_init__(self) -> None:
-        if self.patch % 2 == 0 or not 1 <= self.patch <= 15:
+        if self.patch % 2 == 0 or not 1 <= self.patch <= MAX_PATCH:
             raise PsError(ErrorCode.RECONSTRUCTION_BAD_PARAMETER,
-                          f'patch: {self.patch} must be odd, 1 to 15')
+                          f'patch: {self.patch} must be odd, 1 to {MAX_PATCH}')
         for name in ('spatial_sigma', 'edge_tolerance'):
             if not getattr(self, name) > 0:
                 raise PsError(ErrorCode.RECONSTRUCTION_BAD_PARAMETER, f'{name}: must be positive')
@@ -87,14 +94,6 @@ class Plan:
     trust: Trust
     scatter: float = 0.0
 
-    @property
-    def table(self) -> NDArray[np.float32]:
-        """Of reflectance.tabulate; Lambert's law unless the reflectance is trusted."""
-        trusted = self.trust == Trust.REFLECTANCE
-        table: NDArray[np.float32] = reflectance.tabulate(
-            self.coefficients if trusted else np.zeros(reflectance.TERMS))
-        return table
-
 
 def solve(problem: Problem, options: StvOptions | None = None, quality: bool = True,
           out: Solution | None = None) -> Solution:
@@ -110,11 +109,12 @@ def solve(problem: Problem, options: StvOptions | None = None, quality: bool = T
     result = out if out is not None else empty_solution(problem, quality)
     height, width = problem.shape
     decided = plan(problem, options)
-    table, trust = decided.table, int(decided.trust)
-    lights = problem.lights.astype(np.float32)
-    view = _view(problem).astype(np.float32)
+    reject, reflect = decided.trust > Trust.LEAST_SQUARES, decided.trust == Trust.REFLECTANCE
+    coefficients = decided.coefficients.astype(np.float32)
+    lights = _planes(problem.lights)
+    view = _planes(_view(problem))
     flat = (np.zeros((0, 0, 0), np.float32) if problem.reciprocal_flat is None
-            else problem.reciprocal_flat.astype(np.float32))
+            else _planes(problem.reciprocal_flat))
     spatial = _spatial(options)
     radius = options.patch // 2
     edge = options.edge_tolerance * decided.scatter
@@ -129,10 +129,11 @@ def solve(problem: Problem, options: StvOptions | None = None, quality: bool = T
         shading = np.zeros((problem.count if problem.colour else 0, *shape), np.float32)
         tally = np.zeros((4, *shape), np.float32)
         reason = np.zeros(shape, np.uint8)
-        solve_pixels(grey, saturated, mask, lights, view, flat, problem.step, top, table,
-                     options.rounds, trust, reference, scaled, equations, shading, tally, reason)
+        solve_pixels(grey, saturated, mask, lights, view, flat, problem.step, top,
+                     coefficients, options.rounds, reject, reflect, reference, scaled, equations,
+                     shading, tally, reason)
         inner = slice(first - top, last - top)
-        if trust == Trust.LEAST_SQUARES:
+        if not reject:
             solved = reference[:, inner]
         else:
             solved = np.empty((3, last - first, width), np.float32)
@@ -169,28 +170,33 @@ def plan(problem: Problem, options: StvOptions | None = None) -> Plan:
     ones included: |difference| / mean intensity of the pixel, its upper quartile.
     """
     options = options or StvOptions()
-    lambertian = Plan(np.zeros(reflectance.TERMS), Trust.REJECTION)
     u, d, h, usable, g_ls = _samples(problem)
-    if problem.count == 3 or len(u) == 0:
-        return Plan(lambertian.coefficients, Trust.LEAST_SQUARES)
-    g_first = g_ls.copy()
-    estimate_samples(u, d, h, usable, lambertian.table, 0, int(Trust.REJECTION), g_first)
-    coefficients, g = lambertian.coefficients, g_first.copy()
+    lambertian = np.zeros(reflectance.TERMS)
+    if problem.count == 3 or u.shape[1] == 0:
+        return Plan(lambertian, Trust.LEAST_SQUARES)
+
+    def estimated(coefficients: NDArray, trust: Trust) -> NDArray[np.float32]:
+        g = g_ls.copy()
+        estimate_samples(u, d, h, usable, coefficients.astype(np.float32), options.rounds,
+                         trust > Trust.LEAST_SQUARES, trust == Trust.REFLECTANCE, g)
+        return g
+
+    g_first = estimated(lambertian, Trust.REJECTION)
+    coefficients, g = lambertian, g_first
     exact = [a.astype(np.float64) for a in (u, d, h)]
     for _ in range(ROUNDS):
         coefficients = reflectance.improved(coefficients, *reflectance.normal_equations(
-            *exact, usable, g.astype(np.float64), coefficients, LEAST_COSINE, LEAST_RATIO,
-            MOST_RATIO, HUBER))
-        fitted = Plan(coefficients, Trust.REFLECTANCE)
-        g = g_ls.copy()
-        estimate_samples(u, d, h, usable, fitted.table, options.rounds, int(fitted.trust), g)
+            *exact, usable, g.astype(np.float64), coefficients, LEAST_COSINE,
+            LEAST_RATIO, MOST_RATIO, HUBER))
+        g = estimated(coefficients, Trust.REFLECTANCE)
     misfit_ls = _misfit(u, d, h, g_ls, lambertian)
     level = {
         Trust.LEAST_SQUARES: np.quantile(misfit_ls, QUANTILE),
         Trust.REJECTION: np.quantile(_misfit(u, d, h, g_first, lambertian), QUANTILE),
-        Trust.REFLECTANCE: np.quantile(_misfit(u, d, h, g, fitted), QUANTILE)}
-    if problem.count >= MANY:
-        trust = min(reversed(Trust), key=lambda choice: float(level[choice]))
+        Trust.REFLECTANCE: np.quantile(_misfit(u, d, h, g, coefficients), QUANTILE)}
+    if problem.count >= MANY:      # the first estimate has never been worse than LS here
+        fits = level[Trust.REFLECTANCE] <= level[Trust.REJECTION]
+        trust = Trust.REFLECTANCE if fits else Trust.REJECTION
     elif np.median(misfit_ls) > NOT_LAMBERTIAN:
         trust = Trust.LEAST_SQUARES
     else:      # dropping frames always lowers the misfit of few; that alone must not count
@@ -200,20 +206,25 @@ def plan(problem: Problem, options: StvOptions | None = None) -> Plan:
     return Plan(coefficients, trust, max(float(level[trust] * (4 / problem.count) ** 0.5), 1e-4))
 
 
-def _misfit(u: NDArray, d: NDArray, h: NDArray, g: NDArray, plan: Plan) -> NDArray:
-    """Relative differences between samples and prediction, (P, T), at most 1."""
-    length = np.maximum(np.linalg.norm(g, axis=1, keepdims=True), 1e-12)
-    cosine = np.clip(np.einsum('pi,pti->pt', g, d) / length, 0, 1)
-    half = np.clip(np.einsum('pi,pti->pt', g, h) / length, reflectance.LEAST_HALF, 1)
-    predicted = length * cosine * reflectance.look_up_all(plan.table, cosine, half)
-    level = np.maximum(np.mean(u, axis=1, keepdims=True), 1e-12)
+def _misfit(u: NDArray, d: NDArray, h: NDArray, g: NDArray, coefficients: NDArray) -> NDArray:
+    """Relative differences between samples and prediction, (T, P), at most 1."""
+    length = np.maximum(np.linalg.norm(g, axis=0), 1e-12)
+    cosine = np.clip(np.einsum('ip,tip->tp', g, d) / length, 1e-3, 1)
+    half = np.clip(np.einsum('ip,tip->tp', g, h) / length, reflectance.LEAST_HALF, 1)
+    predicted = length * cosine * reflectance.departures(coefficients, cosine, half)
+    level = np.maximum(np.mean(u, axis=0), 1e-12)
     return np.minimum(np.abs(u - predicted) / level, 1)
+
+
+def _planes(grid: NDArray) -> NDArray[np.float32]:
+    """Nodes (gh, gw, ...) as float32 planes (..., gh, gw)."""
+    return np.ascontiguousarray(np.moveaxis(grid, (0, 1), (-2, -1)), np.float32)
 
 
 def _samples(problem: Problem) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
     """At most about SAMPLES pixels spread over the mask.
 
-    :returns: u (P, T), d (P, T, 3), h (P, T, 3), usable (P, T), g_ls (P, 3), float32.
+    :returns: u (T, P), d (T, 3, P), h (T, 3, P), usable (T, P) 0 or 1, g_ls (3, P), float32.
     """
     height, width = problem.shape
     if problem.mask is None:
@@ -244,8 +255,9 @@ def _samples(problem: Problem) -> tuple[NDArray, NDArray, NDArray, NDArray, NDAr
     d = lights / irradiance[..., None]
     h = d + view[:, None]
     h /= np.linalg.norm(h, axis=2, keepdims=True)
-    single = [np.ascontiguousarray(a, np.float32) for a in (values / irradiance, d, h, g_ls)]
-    return single[0], single[1], single[2], usable, single[3]
+    u, d, h = (np.moveaxis(a, 0, -1) for a in (values / irradiance, d, h))
+    single = [np.ascontiguousarray(a, np.float32) for a in (u, d, h, usable.T, g_ls.T)]
+    return single[0], single[1], single[2], single[3], single[4]
 
 
 def _interpolate(grid: NDArray, row: NDArray, column: NDArray) -> NDArray:

@@ -6,172 +6,212 @@ One function per kernel; a GPU version would replace `solve_pixels`, `combine_pa
 import numba
 import numpy as np
 
-from ps_reconstruction.outliers import MANY, first_of_few, first_of_many, refine
+from ps_reconstruction.outliers import (
+    CHUNK,
+    D0,
+    D1,
+    D2,
+    EQUATION_SIZE,
+    FACTOR,
+    FAST,
+    FRAME_SIZE,
+    G0,
+    G1,
+    G2,
+    H0,
+    H1,
+    H2,
+    INVERSE,
+    LEAST_COSINE,
+    LEAST_RATIO,
+    LENGTH,
+    PIXEL_SIZE,
+    USABLE,
+    WEIGHT,
+    E,
+    U,
+    add_equations,
+    estimate,
+    solve_equations,
+)
 from ps_reconstruction.problem import FEW_LIGHTS, HIGHLIGHT, MASKED, SATURATED, SHADOW
-from ps_reconstruction.reflectance import solve3
 
-KEEP_LS, REJECT, REFLECT = 0, 1, 2        # stv.Trust, as numba sees it
 BRIGHT_MARGIN = 0.1                       # of |g|: brighter than Lambert's law by this is gloss
 NOISE = 0.01                              # relative error of an intensity that is always there
 ERROR_HALF = 0.04                         # expected error of a unit normal that halves confidence
-FAST = {'contract', 'reassoc', 'arcp', 'nsz', 'afn'}    # without nnan: NaN marks invalid pixels
+# Sums over the frames of a chunk: squared residuals, intensity, frames used, misfit
+SQUARES, LIGHT, USED, MISFIT = 0, CHUNK, 2 * CHUNK, 3 * CHUNK
+SUMS_SIZE = 4 * CHUNK
+MAX_PATCH = 15
+SIDE = CHUNK + MAX_PATCH - 1                # of a chunk with its neighbours
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def estimate(u, d, h, usable, table, rounds, trust, g, weight, factor):    # type: ignore[no-untyped-def]
-    """Robust scaled normal of one pixel: g (3,) holds LS on entry and the estimate on return.
-
-    ``weight`` and ``factor`` (T,) return the frame weights and f / (n.l).
-    """
-    factor[:] = 1
-    if trust == KEEP_LS:
-        weight[:] = 1
-        return
-    if u.size >= MANY:
-        first_of_many(u, d, usable, weight, g)
-    else:
-        first_of_few(u, d, h, usable, weight, g)
-    if trust == REFLECT:
-        if u.size < MANY:      # what the first test dropped stays dropped
-            refine(u, d, h, weight > 0, table, rounds, g, weight, factor)
-        else:
-            refine(u, d, h, usable, table, rounds, g, weight, factor)
-
-
-@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def estimate_samples(u, d, h, usable, table, rounds, trust, g):    # type: ignore[no-untyped-def]
-    """`estimate` for (P, T) samples; g (P, 3) in and out."""
-    weight, factor = np.empty(u.shape[1], np.float32), np.empty(u.shape[1], np.float32)
-    for p in range(u.shape[0]):
-        estimate(u[p], d[p], h[p], usable[p], table, rounds, trust, g[p], weight, factor)
-
-
-@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def solve_pixels(values, saturated, mask, lights, view, flat, step, top, table, rounds, trust,
-                 reference, scaled, equations, shading, quality, reason):    # type: ignore[no-untyped-def]
+def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coefficients, rounds,
+                 rejecting, reflecting, reference, scaled, equations, shading, quality, reason):    # type: ignore[no-untyped-def]
     """Temporal weights, own estimate and normal equations of every pixel of a band.
 
     :param values: (T, h, W) intensities, before the flat field.
     :param saturated: (T, h, W) bool, or of size 0 for none.
     :param mask: (h, W) bool.
-    :param lights: (gh, gw, T, 3) at the nodes; view: (gh, gw, 3); flat: (gh, gw, T) reciprocal
+    :param lights: (T, 3, gh, gw) at the nodes; view: (3, gh, gw); flat: (T, gh, gw) reciprocal
         flat field, or of size 0. ``top`` is the image row of the band's first row.
     :param reference: (3, h, W) out, least squares.
     :param scaled: (3, h, W) out, the pixel's own robust estimate; 0 where there is none.
     :param equations: (9, h, W) out, xx xy xz yy yz zz of the matrix and the right side.
     :param shading: (T, h, W) out, weights that turn intensities into albedo; or of size 0.
-    :param quality: (4, h, W) out: sum of squared residuals, mean intensity, frames used,
-        expected error of the unit normal.
+    :param quality: (4, h, W) out: mean squared residual, mean intensity, frames used, misfit of
+        all frames relative to |g|.
     :param reason: (h, W) uint8 out.
     """
     count, rows, width = values.shape
-    u, e = np.empty(count, np.float32), np.empty(count, np.float32)
-    d, h = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
-    weight, factor = np.empty(count, np.float32), np.empty(count, np.float32)
-    usable = np.empty(count, np.bool_)
-    g, look = np.zeros(3, np.float32), np.zeros(3, np.float32)
-    a, b = np.empty(6, np.float32), np.empty(3, np.float32)
+    # a stretch shorter than CHUNK leaves the end of these to numbers that nobody reads
+    frames = np.empty((count, FRAME_SIZE), np.float32)
+    pixels, system = np.empty(PIXEL_SIZE, np.float32), np.empty(EQUATION_SIZE, np.float32)
+    look, gain = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.float32)
+    sums, flags = np.empty(SUMS_SIZE, np.float32), np.empty(CHUNK, np.int32)
     one = np.float32(1)
     for y in range(rows):
         i = (top + y) // step
         fy = np.float32(top + y - i * step) / np.float32(step)
-        for x in range(width):
-            if not mask[y, x]:
+        end = 0
+        while end < width:
+            begin = end
+            j = begin // step
+            end = min(begin + CHUNK, (j + 1) * step, width)
+            n = end - begin
+            if not mask[y, begin:end].any():
                 continue
-            j = x // step
-            fx = np.float32(x - j * step) / np.float32(step)
-            w00, w01 = (one - fy) * (one - fx), (one - fy) * fx
-            w10, w11 = fy * (one - fx), fy * fx
+            system[:], sums[:], flags[:], pixels[:] = 0, 0, 0, 0
             for m in range(3):
-                look[m] = (w00 * view[i, j, m] + w01 * view[i, j + 1, m]
-                           + w10 * view[i + 1, j, m] + w11 * view[i + 1, j + 1, m])
-            a[:], b[:] = 0, 0
-            mean = np.float32(0)
-            flags = np.uint8(0)
+                interpolate(view[m], i, j, fy, begin, step, look, m * CHUNK)
             for t in range(count):
-                s0 = (w00 * lights[i, j, t, 0] + w01 * lights[i, j + 1, t, 0]
-                      + w10 * lights[i + 1, j, t, 0] + w11 * lights[i + 1, j + 1, t, 0])
-                s1 = (w00 * lights[i, j, t, 1] + w01 * lights[i, j + 1, t, 1]
-                      + w10 * lights[i + 1, j, t, 1] + w11 * lights[i + 1, j + 1, t, 1])
-                s2 = (w00 * lights[i, j, t, 2] + w01 * lights[i, j + 1, t, 2]
-                      + w10 * lights[i + 1, j, t, 2] + w11 * lights[i + 1, j + 1, t, 2])
-                v = values[t, y, x]
+                frame = frames[t]
+                frame[U:U + CHUNK] = 1
+                frame[U:U + n] = values[t, y, begin:end]
+                frame[USABLE:USABLE + CHUNK] = 1
+                if saturated.size:
+                    for x in range(n):
+                        if saturated[t, y, begin + x]:
+                            frame[USABLE + x] = 0
+                            flags[x] |= np.int32(SATURATED)
                 if flat.size:
-                    v *= (w00 * flat[i, j, t] + w01 * flat[i, j + 1, t]
-                          + w10 * flat[i + 1, j, t] + w11 * flat[i + 1, j + 1, t])
-                a[0] += s0 * s0
-                a[1] += s0 * s1
-                a[2] += s0 * s2
-                a[3] += s1 * s1
-                a[4] += s1 * s2
-                a[5] += s2 * s2
-                b[0] += v * s0
-                b[1] += v * s1
-                b[2] += v * s2
-                e[t] = np.sqrt(s0 * s0 + s1 * s1 + s2 * s2)
-                inverse = one / e[t]
-                u[t] = v * inverse
-                mean += v
-                d[t, 0], d[t, 1], d[t, 2] = s0 * inverse, s1 * inverse, s2 * inverse
-                h0, h1, h2 = d[t, 0] + look[0], d[t, 1] + look[1], d[t, 2] + look[2]
-                inverse = one / np.sqrt(h0 * h0 + h1 * h1 + h2 * h2)
-                h[t, 0], h[t, 1], h[t, 2] = h0 * inverse, h1 * inverse, h2 * inverse
-                usable[t] = True
-                if saturated.size and saturated[t, y, x]:
-                    usable[t] = False
-                    flags |= np.uint8(SATURATED)
-            if not (mean > 0 and solve3(a, b, g)):
-                reason[y, x] = np.uint8(FEW_LIGHTS)
-                continue
-            reference[0, y, x], reference[1, y, x], reference[2, y, x] = g[0], g[1], g[2]
-            estimate(u, d, h, usable, table, rounds, trust, g, weight, factor)
-            length = np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
-            a[:] = 0
-            b[:] = 0
-            used, squares, misfit, norm = 0, np.float32(0), np.float32(0), np.float32(0)
-            for t in range(count):
-                cosine = g[0] * d[t, 0] + g[1] * d[t, 1] + g[2] * d[t, 2]
-                predicted = max(factor[t] * cosine, np.float32(0))
-                difference = u[t] - predicted
-                if cosine < np.float32(0.1) * length or u[t] < np.float32(0.6) * predicted:
-                    flags |= np.uint8(SHADOW)
-                elif u[t] > cosine + np.float32(BRIGHT_MARGIN) * length:
-                    flags |= np.uint8(HIGHLIGHT)
-                misfit += min(abs(difference), length)
-                if weight[t] > 0:
-                    used += 1
-                    squares += weight[t] * difference * difference
-                    scale = factor[t] * e[t]
-                    w = weight[t] * scale * scale
-                    a[0] += w * d[t, 0] * d[t, 0]
-                    a[1] += w * d[t, 0] * d[t, 1]
-                    a[2] += w * d[t, 0] * d[t, 2]
-                    a[3] += w * d[t, 1] * d[t, 1]
-                    a[4] += w * d[t, 1] * d[t, 2]
-                    a[5] += w * d[t, 2] * d[t, 2]
-                    w *= u[t] / factor[t]
-                    b[0] += w * d[t, 0]
-                    b[1] += w * d[t, 1]
-                    b[2] += w * d[t, 2]
-                if shading.size:
-                    shade = predicted * e[t] / length
-                    shading[t, y, x] = weight[t] * shade
-                    norm += weight[t] * shade * shade
-            if shading.size and norm > 0:
-                for t in range(count):
-                    shading[t, y, x] /= norm
-            if used < 3:
-                flags |= np.uint8(FEW_LIGHTS)
+                    interpolate(flat[t], i, j, fy, begin, step, gain, 0)
+                    for x in range(CHUNK):
+                        frame[U + x] *= gain[x]
+                for m in range(3):
+                    interpolate(lights[t, m], i, j, fy, begin, step, frame, D0 + m * CHUNK)
+                normalise(frame, look, sums)
+                add_equations(frame, system)
+            solve_equations(system, pixels)
             for m in range(3):
-                scaled[m, y, x] = g[m]
-                equations[6 + m, y, x] = b[m]
-            for m in range(6):
-                equations[m, y, x] = a[m]
-            quality[0, y, x] = squares / max(used - 3, 1)
-            quality[1, y, x] = mean / count
-            quality[2, y, x] = used
-            quality[3, y, x] = misfit / (count * length)
-            reason[y, x] = flags
+                reference[m, y, begin:end] = pixels[m * CHUNK:m * CHUNK + n]
+            estimate(frames, coefficients, rounds, rejecting, reflecting, system, pixels)
+            system[:] = 0
+            for t in range(count):
+                judge(frames[t], pixels, sums, flags)
+                add_equations(frames[t], system)
+            if shading.size:
+                shade(frames, pixels, shading[:, y, begin:end])
+            for x in range(n):
+                quality[0, y, begin + x] = sums[SQUARES + x] / max(
+                    sums[USED + x] - np.float32(3), one)
+                quality[1, y, begin + x] = sums[LIGHT + x] / np.float32(count)
+                quality[2, y, begin + x] = sums[USED + x]
+                quality[3, y, begin + x] = (sums[MISFIT + x] * pixels[INVERSE + x]
+                                            / np.float32(count))
+                few = np.int32(FEW_LIGHTS) if sums[USED + x] < np.float32(3) else np.int32(0)
+                reason[y, begin + x] = np.uint8(flags[x] | few)
+            if not mask[y, begin:end].all():
+                for x in range(n):
+                    if not mask[y, begin + x]:
+                        for m in range(3):
+                            pixels[m * CHUNK + x] = 0
+                        for m in range(9):
+                            system[m * CHUNK + x] = 0
+            for m in range(3):
+                scaled[m, y, begin:end] = pixels[m * CHUNK:m * CHUNK + n]
+            for m in range(9):
+                equations[m, y, begin:end] = system[m * CHUNK:m * CHUNK + n]
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def interpolate(grid, i, j, fy, begin, step, out, offset):    # type: ignore[no-untyped-def]
+    """One quantity of the nodes, (gh, gw), along a stretch of a row inside the cell (i, j)."""
+    left = grid[i, j] + fy * (grid[i + 1, j] - grid[i, j])
+    right = grid[i, j + 1] + fy * (grid[i + 1, j + 1] - grid[i, j + 1])
+    slope = (right - left) / np.float32(step)
+    left += slope * np.float32(begin - j * step)
+    for x in range(CHUNK):
+        out[offset + x] = left + slope * np.float32(x)
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def normalise(frame, look, sums):    # type: ignore[no-untyped-def]
+    """From intensity U and light vector D to intensity per irradiance, irradiance, unit vector.
+
+    Sets the half-vector too, and WEIGHT and FACTOR such that `add_equations` adds the equations
+    of the intensity, as least squares has them.
+    """
+    one = np.float32(1)
+    for x in range(CHUNK):
+        d0, d1, d2, u = frame[D0 + x], frame[D1 + x], frame[D2 + x], frame[U + x]
+        square = d0 * d0 + d1 * d1 + d2 * d2
+        inverse = one / np.sqrt(square)
+        d0, d1, d2 = d0 * inverse, d1 * inverse, d2 * inverse
+        h0, h1, h2 = d0 + look[x], d1 + look[CHUNK + x], d2 + look[2 * CHUNK + x]
+        half = one / np.sqrt(h0 * h0 + h1 * h1 + h2 * h2)
+        sums[LIGHT + x] += u
+        frame[U + x], frame[E + x] = u * inverse, square * inverse
+        frame[D0 + x], frame[D1 + x], frame[D2 + x] = d0, d1, d2
+        frame[H0 + x], frame[H1 + x], frame[H2 + x] = h0 * half, h1 * half, h2 * half
+        frame[WEIGHT + x], frame[FACTOR + x] = square, one
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def judge(frame, pixels, sums, flags):    # type: ignore[no-untyped-def]
+    """Compare a frame with its prediction: add to ``sums``, set bits of ``flags``.
+
+    Multiplies WEIGHT by the squared irradiance: from here on the equations are those of the
+    intensity (Eq. 6).
+    """
+    zero, one = np.float32(0), np.float32(1)
+    shadow, highlight, none = np.int32(SHADOW), np.int32(HIGHLIGHT), np.int32(0)
+    for x in range(CHUNK):
+        cosine = (pixels[G0 + x] * frame[D0 + x] + pixels[G1 + x] * frame[D1 + x]
+                  + pixels[G2 + x] * frame[D2 + x])
+        length, u, weight = pixels[LENGTH + x], frame[U + x], frame[WEIGHT + x]
+        predicted = max(frame[FACTOR + x] * cosine, zero)
+        difference = u - predicted
+        square = weight * frame[E + x] * frame[E + x]
+        sums[SQUARES + x] += square * difference * difference
+        sums[USED + x] += one if weight > zero else zero
+        sums[MISFIT + x] += min(abs(difference), length)
+        dark = ((cosine < np.float32(LEAST_COSINE) * length)
+                | (u < np.float32(LEAST_RATIO) * predicted))
+        bright = u > cosine + np.float32(BRIGHT_MARGIN) * length
+        flags[x] |= shadow if dark else (highlight if bright else none)
+        frame[WEIGHT + x] = square
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def shade(frames, pixels, shading):    # type: ignore[no-untyped-def]
+    """Weights w p / sum w p^2 that turn intensities into albedo, p predicted for albedo 1.
+
+    :param shading: (T, n) out.
+    """
+    count, n = shading.shape
+    for x in range(n):
+        norm = np.float32(1e-30)
+        for t in range(count):
+            cosine = (pixels[G0 + x] * frames[t, D0 + x] + pixels[G1 + x] * frames[t, D1 + x]
+                      + pixels[G2 + x] * frames[t, D2 + x]) * pixels[INVERSE + x]
+            # the weight carries the squared irradiance, the prediction the irradiance
+            predicted = max(cosine, np.float32(0)) * frames[t, FACTOR + x]
+            shading[t, x] = frames[t, WEIGHT + x] * predicted / frames[t, E + x]
+            norm += frames[t, WEIGHT + x] * predicted * predicted
+        for t in range(count):
+            shading[t, x] /= norm
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
@@ -187,67 +227,72 @@ def combine_patches(reference, scaled, equations, spatial, edge_sigma, ridge, fi
     _, rows, width = solved.shape
     height = reference.shape[1]
     radius = spatial.shape[0] // 2
-    total = np.empty((9, width), np.float32)
-    near = np.empty(width, np.float32)
-    a, b, g = np.empty(6, np.float32), np.empty(3, np.float32), np.empty(3, np.float32)
+    pixels, system = np.empty(PIXEL_SIZE, np.float32), np.empty(EQUATION_SIZE, np.float32)
+    near = np.empty(CHUNK, np.float32)
+    # rows of the neighbourhood: scaled normals and equations, quantity after quantity, SIDE apart;
+    # what lies beside the image has no equations, so it counts nothing
+    around = np.zeros((2 * radius + 1, 12 * SIDE), np.float32)
     one = np.float32(1)
     for y in range(rows):
         here = first + y
-        g0, g1, g2 = scaled[0, here], scaled[1, here], scaled[2, here]
-        for x in range(width):
-            square = g0[x] * g0[x] + g1[x] * g1[x] + g2[x] * g2[x]
-            near[x] = one / (np.float32(edge_sigma * edge_sigma) * square + np.float32(1e-30))
-        total[:] = 0
-        for dy in range(-radius, radius + 1):
-            there = here + dy
-            if not 0 <= there < height:
-                continue
-            for dx in range(-radius, radius + 1):
-                w_spatial = spatial[dy + radius, dx + radius]
-                begin, end = max(0, -dx), min(width, width - dx)
-                q0 = scaled[0, there, begin + dx:end + dx]
-                q1 = scaled[1, there, begin + dx:end + dx]
-                q2 = scaled[2, there, begin + dx:end + dx]
-                p0, p1, p2 = g0[begin:end], g1[begin:end], g2[begin:end]
-                close, n = near[begin:end], end - begin
-                c0 = equations[0, there, begin + dx:end + dx]
-                c1 = equations[1, there, begin + dx:end + dx]
-                c2 = equations[2, there, begin + dx:end + dx]
-                c3 = equations[3, there, begin + dx:end + dx]
-                c4 = equations[4, there, begin + dx:end + dx]
-                c5 = equations[5, there, begin + dx:end + dx]
-                c6 = equations[6, there, begin + dx:end + dx]
-                c7 = equations[7, there, begin + dx:end + dx]
-                c8 = equations[8, there, begin + dx:end + dx]
-                t0, t1, t2 = total[0, begin:end], total[1, begin:end], total[2, begin:end]
-                t3, t4, t5 = total[3, begin:end], total[4, begin:end], total[5, begin:end]
-                t6, t7, t8 = total[6, begin:end], total[7, begin:end], total[8, begin:end]
+        for begin in range(0, width, CHUNK):
+            n = min(CHUNK, width - begin)
+            left, right = max(begin - radius, 0), min(begin + CHUNK + radius, width)
+            start = left - (begin - radius)
+            for dy in range(2 * radius + 1):
+                row, there = around[dy], here + dy - radius
+                row[:] = 0
+                if 0 <= there < height:
+                    for m in range(3):
+                        row[m * SIDE + start:m * SIDE + start + right - left] = scaled[
+                            m, there, left:right]
+                    for m in range(9):
+                        row[(3 + m) * SIDE + start:(3 + m) * SIDE + start + right - left] = (
+                            equations[m, there, left:right])
+            for m in range(3):
+                origin = m * SIDE + radius
+                pixels[m * CHUNK:(m + 1) * CHUNK] = around[radius, origin:origin + CHUNK]
+            for x in range(CHUNK):
+                g0, g1, g2 = pixels[G0 + x], pixels[G1 + x], pixels[G2 + x]
+                near[x] = one / (np.float32(edge_sigma * edge_sigma)
+                                 * (g0 * g0 + g1 * g1 + g2 * g2) + np.float32(1e-30))
+            system[:] = 0
+            for dy in range(2 * radius + 1):
+                for dx in range(2 * radius + 1):
+                    add_neighbour(around[dy], dx, spatial[dy, dx], near, pixels, system)
+            for x in range(CHUNK):
+                strength = np.float32(ridge / 3) * (
+                    system[x] + system[3 * CHUNK + x] + system[5 * CHUNK + x])
+                near[x] = strength
+                system[x] += strength
+                system[3 * CHUNK + x] += strength
+                system[5 * CHUNK + x] += strength
+            for m in range(3):
                 for x in range(n):
-                    d0, d1, d2 = q0[x] - p0[x], q1[x] - p1[x], q2[x] - p2[x]
-                    w = w_spatial / (one + (d0 * d0 + d1 * d1 + d2 * d2) * close[x])
-                    t0[x] += w * c0[x]
-                    t1[x] += w * c1[x]
-                    t2[x] += w * c2[x]
-                    t3[x] += w * c3[x]
-                    t4[x] += w * c4[x]
-                    t5[x] += w * c5[x]
-                    t6[x] += w * c6[x]
-                    t7[x] += w * c7[x]
-                    t8[x] += w * c8[x]
-        for x in range(width):
-            strength = np.float32(ridge) * (total[0, x] + total[3, x] + total[5, x]) / 3
-            for m in range(6):
-                a[m] = total[m, x]
-            a[0] += strength
-            a[3] += strength
-            a[5] += strength
+                    system[(6 + m) * CHUNK + x] += near[x] * reference[m, here, begin + x]
+            solve_equations(system, pixels)
             for m in range(3):
-                b[m] = total[6 + m, x] + strength * reference[m, here, x]
-            g[:] = 0
-            if (g0[x] != 0 or g1[x] != 0 or g2[x] != 0) and not solve3(a, b, g):
-                g[0], g[1], g[2] = g0[x], g1[x], g2[x]
-            for m in range(3):
-                solved[m, y, x] = g[m]
+                solved[m, y, begin:begin + n] = pixels[m * CHUNK:m * CHUNK + n]
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def add_neighbour(row, dx, spatial, near, pixels, system):    # type: ignore[no-untyped-def]
+    """Add the equations of one neighbour of every pixel, times w_patch: spatial x edge-aware."""
+    one = np.float32(1)
+    for x in range(CHUNK):
+        q = dx + x
+        d0, d1, d2 = (row[q] - pixels[G0 + x], row[SIDE + q] - pixels[G1 + x],
+                      row[2 * SIDE + q] - pixels[G2 + x])
+        w = spatial / (one + (d0 * d0 + d1 * d1 + d2 * d2) * near[x])
+        system[x] += w * row[3 * SIDE + q]
+        system[CHUNK + x] += w * row[4 * SIDE + q]
+        system[2 * CHUNK + x] += w * row[5 * SIDE + q]
+        system[3 * CHUNK + x] += w * row[6 * SIDE + q]
+        system[4 * CHUNK + x] += w * row[7 * SIDE + q]
+        system[5 * CHUNK + x] += w * row[8 * SIDE + q]
+        system[6 * CHUNK + x] += w * row[9 * SIDE + q]
+        system[7 * CHUNK + x] += w * row[10 * SIDE + q]
+        system[8 * CHUNK + x] += w * row[11 * SIDE + q]
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
@@ -259,7 +304,7 @@ def finish(solved, quality, mask, count, normal, albedo, confidence, reason):   
     """
     rows, width = mask.shape
     squares, brightness, valid = 0.0, 0.0, 0
-    nan = np.float32(np.nan)
+    nan, one = np.float32(np.nan), np.float32(1)
     for y in range(rows):
         for x in range(width):
             g0, g1, g2 = solved[0, y, x], solved[1, y, x], solved[2, y, x]
@@ -273,14 +318,16 @@ def finish(solved, quality, mask, count, normal, albedo, confidence, reason):   
                     reason[y, x] |= np.uint8(FEW_LIGHTS)
                 continue
             length = np.sqrt(g0 * g0 + g1 * g1 + g2 * g2)
-            normal[y, x, 0] = g0 / length
-            normal[y, x, 1] = g1 / length
-            normal[y, x, 2] = g2 / length
+            inverse = one / length
+            normal[y, x, 0] = g0 * inverse
+            normal[y, x, 1] = g1 * inverse
+            normal[y, x, 2] = g2 * inverse
             albedo[y, x] = length
             squares += quality[0, y, x]
             brightness += quality[1, y, x]
             valid += 1
-            used = quality[2, y, x]
-            error = (np.float32(NOISE) + quality[3, y, x]) * np.sqrt(count / max(used, 1.0))
-            confidence[y, x] = max(1, int(255 / (1 + error / ERROR_HALF) + 0.5))
+            used = max(quality[2, y, x], one)
+            error = (np.float32(NOISE) + quality[3, y, x]) * np.sqrt(np.float32(count) / used)
+            certainty = one / (one + error / np.float32(ERROR_HALF))
+            confidence[y, x] = max(1, int(np.float32(255) * certainty + np.float32(0.5)))
     return squares, brightness, valid

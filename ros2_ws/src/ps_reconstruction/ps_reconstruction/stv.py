@@ -36,7 +36,8 @@ from ps_reconstruction.outliers import (
 from ps_reconstruction.problem import GREY_WEIGHTS, Problem, Solution
 from ps_reconstruction.stv_kernels import MAX_PATCH, combine_patches, finish, solve_pixels
 
-BAND = 16                     # rows per band
+BAND, LEAST_BAND = 48, 16     # rows per band; fewer for many lights, to bound the memory
+BAND_FRAMES = 768             # rows times lights of a band
 SAMPLES = 4000                # pixels that the plan looks at
 ROUNDS = 5                    # of the reflectance fit
 NOT_LAMBERTIAN = 0.04         # median misfit of LS from which few lights tell nothing more
@@ -117,6 +118,7 @@ def solve(problem: Problem, options: StvOptions | None = None, quality: bool = T
             else _planes(problem.reciprocal_flat))
     spatial = _spatial(options)
     radius = options.patch // 2
+    band = max(LEAST_BAND, min(BAND, BAND_FRAMES // problem.count))
     edge = options.edge_tolerance * decided.scatter
 
     def work(first: int, last: int) -> tuple[float, float, int]:
@@ -157,7 +159,7 @@ def solve(problem: Problem, options: StvOptions | None = None, quality: bool = T
             result.reason[first:last] = reason[inner]
         return sums
 
-    squares, brightness, count = np.sum(for_bands(height, BAND, work), axis=0)
+    squares, brightness, count = np.sum(for_bands(height, band, work), axis=0)
     if quality and problem.count > 3 and count and brightness > 0:
         result.residual_rms = float(np.sqrt(squares / count) / (brightness / count))
     return result

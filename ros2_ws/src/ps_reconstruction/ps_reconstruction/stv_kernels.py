@@ -84,7 +84,7 @@ def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coeffic
                 continue
             system[:], sums[:], flags[:], pixels[:] = 0, 0, 0, 0
             for m in range(3):
-                interpolate(view[m], i, j, fy, begin, step, look, m * CHUNK)
+                interpolate(view[m], i, j, fy, begin, step, look[m * CHUNK:])
             for t in range(count):
                 frame = frames[t]
                 frame[U:U + CHUNK] = 1
@@ -96,11 +96,12 @@ def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coeffic
                             frame[USABLE + x] = 0
                             flags[x] |= np.int32(SATURATED)
                 if flat.size:
-                    interpolate(flat[t], i, j, fy, begin, step, gain, 0)
+                    interpolate(flat[t], i, j, fy, begin, step, gain)
                     for x in range(CHUNK):
                         frame[U + x] *= gain[x]
                 for m in range(3):
-                    interpolate(lights[t, m], i, j, fy, begin, step, frame, D0 + m * CHUNK)
+                    interpolate(lights[t, m], i, j, fy, begin, step,
+                                frame[D0 + m * CHUNK:])
                 normalise(frame, look, sums)
                 add_equations(frame, system)
             solve_equations(system, pixels)
@@ -136,14 +137,14 @@ def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coeffic
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def interpolate(grid, i, j, fy, begin, step, out, offset):    # type: ignore[no-untyped-def]
-    """One quantity of the nodes, (gh, gw), along a stretch of a row inside the cell (i, j)."""
+def interpolate(grid, i, j, fy, begin, step, out):    # type: ignore[no-untyped-def]
+    """One quantity of the nodes, (gh, gw), along CHUNK pixels of a row, cell (i, j)."""
     left = grid[i, j] + fy * (grid[i + 1, j] - grid[i, j])
     right = grid[i, j + 1] + fy * (grid[i + 1, j + 1] - grid[i, j + 1])
     slope = (right - left) / np.float32(step)
     left += slope * np.float32(begin - j * step)
     for x in range(CHUNK):
-        out[offset + x] = left + slope * np.float32(x)
+        out[x] = left + slope * np.float32(x)
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
@@ -229,37 +230,39 @@ def combine_patches(reference, scaled, equations, spatial, edge_sigma, ridge, fi
     radius = spatial.shape[0] // 2
     pixels, system = np.empty(PIXEL_SIZE, np.float32), np.empty(EQUATION_SIZE, np.float32)
     near = np.empty(CHUNK, np.float32)
-    # rows of the neighbourhood: scaled normals and equations, quantity after quantity, SIDE apart;
-    # what lies beside the image has no equations, so it counts nothing
-    around = np.zeros((2 * radius + 1, 12 * SIDE), np.float32)
+    # The rows of the neighbourhood in turn, row r at r % ring: scaled normals and equations,
+    # quantity after quantity, SIDE apart. What lies beside the image has no equations.
+    ring = 2 * radius + 1
+    around = np.empty((ring, 12 * SIDE), np.float32)
     one = np.float32(1)
-    for y in range(rows):
-        here = first + y
-        for begin in range(0, width, CHUNK):
-            n = min(CHUNK, width - begin)
-            left, right = max(begin - radius, 0), min(begin + CHUNK + radius, width)
-            start = left - (begin - radius)
-            for dy in range(2 * radius + 1):
-                row, there = around[dy], here + dy - radius
-                row[:] = 0
-                if 0 <= there < height:
-                    for m in range(3):
-                        row[m * SIDE + start:m * SIDE + start + right - left] = scaled[
-                            m, there, left:right]
-                    for m in range(9):
-                        row[(3 + m) * SIDE + start:(3 + m) * SIDE + start + right - left] = (
-                            equations[m, there, left:right])
+    for begin in range(0, width, CHUNK):
+        n = min(CHUNK, width - begin)
+        left, right = max(begin - radius, 0), min(begin + CHUNK + radius, width)
+        start, length = left - (begin - radius), right - left
+        for y in range(-2 * radius, rows):
+            here, new = first + y, first + y + radius
+            row = around[new % ring]
+            row[:] = 0
+            if 0 <= new < height:
+                for m in range(3):
+                    origin = m * SIDE + start
+                    row[origin:origin + length] = scaled[m, new, left:right]
+                for m in range(9):
+                    origin = (3 + m) * SIDE + start
+                    row[origin:origin + length] = equations[m, new, left:right]
+            if y < 0:
+                continue
             for m in range(3):
                 origin = m * SIDE + radius
-                pixels[m * CHUNK:(m + 1) * CHUNK] = around[radius, origin:origin + CHUNK]
+                pixels[m * CHUNK:(m + 1) * CHUNK] = around[here % ring, origin:origin + CHUNK]
             for x in range(CHUNK):
                 g0, g1, g2 = pixels[G0 + x], pixels[G1 + x], pixels[G2 + x]
                 near[x] = one / (np.float32(edge_sigma * edge_sigma)
                                  * (g0 * g0 + g1 * g1 + g2 * g2) + np.float32(1e-30))
             system[:] = 0
-            for dy in range(2 * radius + 1):
-                for dx in range(2 * radius + 1):
-                    add_neighbour(around[dy], dx, spatial[dy, dx], near, pixels, system)
+            for dy in range(ring):
+                add_neighbours(around[(here + dy - radius) % ring], spatial[dy], near, pixels,
+                               system)
             for x in range(CHUNK):
                 strength = np.float32(ridge / 3) * (
                     system[x] + system[3 * CHUNK + x] + system[5 * CHUNK + x])
@@ -276,23 +279,24 @@ def combine_patches(reference, scaled, equations, spatial, edge_sigma, ridge, fi
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def add_neighbour(row, dx, spatial, near, pixels, system):    # type: ignore[no-untyped-def]
-    """Add the equations of one neighbour of every pixel, times w_patch: spatial x edge-aware."""
+def add_neighbours(row, spatial, near, pixels, system):    # type: ignore[no-untyped-def]
+    """Add the equations of the neighbours in one row, times w_patch: spatial x edge-aware."""
     one = np.float32(1)
-    for x in range(CHUNK):
-        q = dx + x
-        d0, d1, d2 = (row[q] - pixels[G0 + x], row[SIDE + q] - pixels[G1 + x],
-                      row[2 * SIDE + q] - pixels[G2 + x])
-        w = spatial / (one + (d0 * d0 + d1 * d1 + d2 * d2) * near[x])
-        system[x] += w * row[3 * SIDE + q]
-        system[CHUNK + x] += w * row[4 * SIDE + q]
-        system[2 * CHUNK + x] += w * row[5 * SIDE + q]
-        system[3 * CHUNK + x] += w * row[6 * SIDE + q]
-        system[4 * CHUNK + x] += w * row[7 * SIDE + q]
-        system[5 * CHUNK + x] += w * row[8 * SIDE + q]
-        system[6 * CHUNK + x] += w * row[9 * SIDE + q]
-        system[7 * CHUNK + x] += w * row[10 * SIDE + q]
-        system[8 * CHUNK + x] += w * row[11 * SIDE + q]
+    for dx in range(spatial.size):
+        other, w_spatial = row[dx:], spatial[dx]
+        for x in range(CHUNK):
+            d0, d1, d2 = (other[x] - pixels[G0 + x], other[SIDE + x] - pixels[G1 + x],
+                          other[2 * SIDE + x] - pixels[G2 + x])
+            w = w_spatial / (one + (d0 * d0 + d1 * d1 + d2 * d2) * near[x])
+            system[x] += w * other[3 * SIDE + x]
+            system[CHUNK + x] += w * other[4 * SIDE + x]
+            system[2 * CHUNK + x] += w * other[5 * SIDE + x]
+            system[3 * CHUNK + x] += w * other[6 * SIDE + x]
+            system[4 * CHUNK + x] += w * other[7 * SIDE + x]
+            system[5 * CHUNK + x] += w * other[8 * SIDE + x]
+            system[6 * CHUNK + x] += w * other[9 * SIDE + x]
+            system[7 * CHUNK + x] += w * other[10 * SIDE + x]
+            system[8 * CHUNK + x] += w * other[11 * SIDE + x]
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')

@@ -1,5 +1,5 @@
 """The whole chain as real processes over DDS: capture to published slope, refusals, restarts."""
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 import threading
 import time
@@ -50,6 +50,7 @@ def client(cell: Cell) -> Iterator[CellClient]:
     with CellClient(outputs=OUTPUTS) as connected:
         connected.home()
         connected.illuminate(0.06)
+        connected.wait_for_outputs()
         yield connected
 
 
@@ -111,13 +112,19 @@ def test_explicit_steps_with_ambient_over_the_action(client: CellClient):
     assert not feedback[0].safe_to_move
 
 
-def acquire(client: CellClient, cancel_after: float | None = None, **goal):
+def acquire(client: CellClient, cancel_after: float | None = None,
+            on_feedback: Callable = lambda _: None, **goal):
     feedback: list = []
+
+    def keep(message):
+        feedback.append(message.feedback)
+        on_feedback(message.feedback)
+
     actions = ActionClient(client.node, action.AcquireStack, 'acquire_stack')
     try:
         assert actions.wait_for_server(10.0)
         accepted = wait_for(actions.send_goal_async(
-            action.AcquireStack.Goal(**goal), lambda m: feedback.append(m.feedback)))
+            action.AcquireStack.Goal(**goal), keep))
         assert accepted.accepted
         if cancel_after is not None:
             time.sleep(cancel_after)
@@ -195,17 +202,15 @@ def test_all_alive_after_the_wrong_requests(cell: Cell, client: CellClient):
 def test_second_request_while_busy_is_refused(client: CellClient):
     slow = [ps.LightStep(panel=i % 4, exposure_time=0.1) for i in range(12)]
     results: list = []
-    first = threading.Thread(target=lambda: results.append(acquire(client, steps=slow)[0]))
+    exposing = threading.Event()
+    first = threading.Thread(target=lambda: results.append(
+        acquire(client, on_feedback=lambda _: exposing.set(), steps=slow)[0]))
     first.start()
-    deadline = time.monotonic() + 20
-    code = ErrorCode.NONE
-    while code != ErrorCode.SEQUENCER_BUSY and time.monotonic() < deadline and first.is_alive():
-        try:
-            client.capture()
-        except PsError as error:
-            code = error.code
+    assert exposing.wait(20)
+    with pytest.raises(PsError) as error:
+        client.capture()
+    assert error.value.code == ErrorCode.SEQUENCER_BUSY
     first.join(60)
-    assert code == ErrorCode.SEQUENCER_BUSY
     assert results[0].success, results[0].message
 
 
@@ -256,6 +261,7 @@ def test_killed_reconstruction_comes_back_after_a_restart(cell: Cell, client: Ce
     victim.process.wait(10)
     client.capture()                 # the head goes on without it
     cell.restart('reconstruction')
+    client.wait_for_outputs()
     stack_id = client.capture()
     assert client.reconstruction(stack_id)[0].success
 

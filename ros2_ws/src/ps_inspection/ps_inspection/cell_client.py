@@ -100,6 +100,24 @@ class CellClient:
             raise PsError(ErrorCode.RECONSTRUCTION_TIMEOUT, f'no {what} within {timeout:g} s')
         return found
 
+    def wait_for_outputs(self, timeout: float = 20.0) -> None:
+        """Wait until the reconstruction knows that the output images are wanted.
+
+        Images are lazy: one that is published before publisher and subscriber have found each
+        other is not computed.
+
+        :raises PsError: RECONSTRUCTION_TIMEOUT.
+        """
+        deadline = time.monotonic() + timeout
+        while not all(self.node.count_publishers(OUTPUT_TOPICS[name]) for name in self.images):
+            if time.monotonic() > deadline:
+                raise PsError(ErrorCode.RECONSTRUCTION_TIMEOUT,
+                              f'nobody publishes the output images after {timeout:g} s; is the '
+                              'reconstruction node running?')
+            time.sleep(0.05)
+        # the publisher finds its subscribers at the same time, give or take a message
+        time.sleep(0.3)
+
     # ------------------------------------------------------------------ asking
 
     def call(self, kind: Any, name: str, request: Any = None, timeout: float = 30.0) -> Any:

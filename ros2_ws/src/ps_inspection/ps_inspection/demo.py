@@ -131,6 +131,7 @@ def _inspect(
 ) -> tuple[ps.PhotometricStack, ps.ReconstructionInfo, dict[str, NDArray]]:
     with step('home the motor'):
         client.home()
+        client.wait_for_outputs()
     with step('solve the convergence radius'):
         solution = client.solve(options.convergence_radius)
     with step('move the panels'):

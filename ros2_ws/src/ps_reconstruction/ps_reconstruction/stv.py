@@ -67,7 +67,7 @@ class StvOptions:
 
     patch: int = 5
     spatial_sigma: float = 1.0
-    edge_tolerance: float = 2.5
+    edge_tolerance: float = 1.25
     ridge: float = 1e-3
     rounds: int = 2
     trust: Trust | None = None

@@ -1,0 +1,297 @@
+"""Pictures of a half-ring target with exactly vertical walls, for trying out the calibration.
+
+The height fields of scenes.py round every edge by a grid pitch; the edge of the ring has to be
+sharp to a micrometre. Here rays are followed through the solid itself: base plate, upper face,
+walls, slits. Emitters are sampled over each panel and tested one by one, so soft shadows come out
+by themselves. Shares no code with the calibration.
+"""
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from ps_head_driver.camera_model import camera_center, pixel_rays, scaled_camera
+from ps_head_driver.fake.renderer import Sensor, emitters
+from ps_head_driver.fake.shading import KERNEL_LOCK
+from ps_head_driver.head_model import DIRECTIONS, HeadModel
+from ps_head_driver.kinematics import BrightFieldKinematics, PanelPose
+
+#: Emitters along a panel's width and height, where nothing can stand in the way and elsewhere.
+_FREE, _SHADOWED = (6, 4), (32, 16)
+_PROBES = (7, 5)            # on its edges and inside: where all are free, nothing is in the way
+
+# light on the plate's centre that fills the sensor's range to _LEVEL, see renderer.py
+_REFERENCE_RADIANCE, _LEVEL = 0.014105, 0.6
+
+
+@dataclass(frozen=True)
+class RingSolid:
+    """A half ring on a plate, in its own frame (z out of the plate, ring centre at the origin).
+
+    :param radii: inner and outer, m.
+    :param height: of the wall, m; 0 leaves the plate alone.
+    :param arc: first and last azimuth of the wall, at most half a turn apart.
+    :param slits: azimuths of the slits.
+    :param slit_width: m.
+    :param plate: size of the base, m.
+    :param dots: (F, 2) centres of printed dots, m.
+    :param reflectance: of the wall, the base and the dots.
+    """
+
+    radii: tuple[float, float]
+    height: float
+    arc: tuple[float, float]
+    slits: Sequence[float]
+    slit_width: float
+    plate: tuple[float, float]
+    dots: NDArray
+    dot_radius: float
+    reflectance: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where the target's frame is in ps_head_plane.
+
+    :param position: of its origin, m.
+    :param rotation: (3, 3); columns are the target's axes.
+    """
+
+    position: NDArray
+    rotation: NDArray
+
+
+def placement(x: float = 0.0, y: float = 0.0, z: float = 0.0, turn: float = 0.0,
+              tilt_x: float = 0.0, tilt_y: float = 0.0) -> Placement:
+    """Place a target.
+
+    :param turn: about its normal, rad.
+    :param tilt_x: the plane rises along +x by this, rad; tilt_y the same along +y.
+    """
+    normal = np.array([-math.tan(tilt_x), -math.tan(tilt_y), 1.0])
+    normal /= np.linalg.norm(normal)
+    along = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
+    along /= np.linalg.norm(along)
+    across = np.cross(normal, along)
+    c, s = math.cos(turn), math.sin(turn)
+    return Placement(np.array([x, y, z]), np.stack(
+        [c * along + s * across, -s * along + c * across, normal], axis=1))
+
+
+@nb.njit(cache=True)
+def _solid(x, y, ring, ends, slits):  # type: ignore[no-untyped-def]
+    """Whether the wall stands above (x, y)."""
+    square = x * x + y * y
+    if square < ring[0] * ring[0] or square > ring[1] * ring[1]:
+        return False
+    if ends[0] * y - ends[1] * x < 0.0 or x * ends[3] - y * ends[2] < 0.0:
+        return False
+    for k in range(slits.shape[0]):
+        if (abs(slits[k, 0] * y - slits[k, 1] * x) < ring[3]
+                and slits[k, 0] * x + slits[k, 1] * y > 0.0):
+            return False
+    return True
+
+
+@nb.njit(cache=True)
+def _crossings(x, y, dx, dy, ring, ends, slits, out):  # type: ignore[no-untyped-def]
+    """Fractions 0..1 of the way (dx, dy) from (x, y) at which a face may be crossed, sorted."""
+    n = 0
+    a, b = dx * dx + dy * dy, x * dx + y * dy
+    for k in range(2):
+        c = x * x + y * y - ring[k] * ring[k]
+        inside = b * b - a * c
+        if inside > 0.0 and a > 0.0:
+            root = math.sqrt(inside)
+            for s in ((-b - root) / a, (-b + root) / a):
+                if 0.0 < s < 1.0:
+                    out[n] = s
+                    n += 1
+    for k in range(2):
+        slope = ends[2 * k] * dy - ends[2 * k + 1] * dx
+        if slope != 0.0:
+            s = -(ends[2 * k] * y - ends[2 * k + 1] * x) / slope
+            if 0.0 < s < 1.0:
+                out[n] = s
+                n += 1
+    for k in range(slits.shape[0]):
+        slope = slits[k, 0] * dy - slits[k, 1] * dx
+        if slope != 0.0:
+            offset = slits[k, 0] * y - slits[k, 1] * x
+            for s in ((ring[3] - offset) / slope, (-ring[3] - offset) / slope):
+                if 0.0 < s < 1.0:
+                    out[n] = s
+                    n += 1
+    out[:n].sort()
+    return n
+
+
+@nb.njit(cache=True)
+def _enters(x, y, dx, dy, ring, ends, slits, buffer):  # type: ignore[no-untyped-def]
+    """Fraction of the way at which the wall is first met; 2 if it is not."""
+    if _solid(x, y, ring, ends, slits):
+        return 0.0
+    # most ways stay clear of the whole ring
+    a, b, square = dx * dx + dy * dy, x * dx + y * dy, x * x + y * y
+    s = min(max(-b / a, 0.0), 1.0)
+    if square + s * (2.0 * b + s * a) > ring[1] * ring[1]:
+        return 2.0
+    if max(square, square + 2.0 * b + a) < ring[0] * ring[0]:
+        return 2.0
+    n = _crossings(x, y, dx, dy, ring, ends, slits, buffer)
+    for k in range(n):
+        after = 0.5 * (buffer[k] + (buffer[k + 1] if k + 1 < n else 1.0))
+        if _solid(x + after * dx, y + after * dy, ring, ends, slits):
+            return buffer[k]
+    return 2.0
+
+
+@nb.njit(cache=True, parallel=True)
+def _look(origin, rays, ring, ends, slits, plate, dots, dot_radius, reflectance, pixel):  # type: ignore[no-untyped-def]
+    """What each ray of the camera meets, in the target frame.
+
+    :returns: (N, 7): point, normal, reflectance.
+    """
+    out = np.zeros((rays.shape[0], 7))
+    height = ring[2]
+    for k in nb.prange(rays.shape[0]):
+        buffer = np.empty(32)
+        foot = -origin[2] / rays[k, 2]
+        crown = (height - origin[2]) / rays[k, 2]
+        x, y = origin[0] + crown * rays[k, 0], origin[1] + crown * rays[k, 1]
+        dx, dy = (foot - crown) * rays[k, 0], (foot - crown) * rays[k, 1]
+        met = _enters(x, y, dx, dy, ring, ends, slits, buffer) if height > 0.0 else 2.0
+        if met == 0.0:
+            out[k] = np.array([x, y, height, 0.0, 0.0, 1.0, reflectance[0]])
+        elif met < 1.0:
+            # the wall's own shading is of no use to anybody: give it that of a level face
+            out[k] = np.array([x + met * dx, y + met * dy, height * (1.0 - met),
+                               0.0, 0.0, 1.0, 0.5 * reflectance[0]])
+        else:
+            x, y = x + dx, y + dy
+            albedo = reflectance[1]
+            if abs(x) > plate[0] / 2 or abs(y) > plate[1] / 2:
+                albedo = 0.0
+            for d in range(dots.shape[0]):
+                # a pixel on the edge of a dot sees some of both
+                beyond = math.hypot(x - dots[d, 0], y - dots[d, 1]) - dot_radius
+                part = min(max(0.5 - beyond / pixel, 0.0), 1.0)
+                albedo += part * (reflectance[2] - albedo)
+            out[k] = np.array([x, y, 0.0, 0.0, 0.0, 1.0, albedo])
+    return out
+
+
+@nb.njit(cache=True, parallel=True)
+def _light(points, free, probes, shadowed, axis, lobe, ring, ends, slits):  # type: ignore[no-untyped-def]
+    """Irradiance of each point under one panel, all in the target frame."""
+    out = np.zeros(points.shape[0], np.float32)
+    height = ring[2]
+    for k in nb.prange(points.shape[0]):
+        buffer = np.empty(32)
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        radius = math.hypot(x, y)
+        # the sides and the middle of the panel tell whether any shadow falls here
+        near = False
+        if z < height and radius < 2.0 * ring[1]:
+            for e in range(probes.shape[0]):
+                dx, dy = probes[e, 0] - x, probes[e, 1] - y
+                s = (height - z) / (probes[e, 2] - z)
+                if _enters(x, y, s * dx, s * dy, ring, ends, slits, buffer) < 1.0:
+                    near = True
+                    break
+        sources = shadowed if near else free
+        total = 0.0
+        for e in range(sources.shape[0]):
+            dx, dy, dz = sources[e, 0] - x, sources[e, 1] - y, sources[e, 2] - z
+            square = dx * dx + dy * dy + dz * dz
+            distance = math.sqrt(square)
+            cos_e = -(axis[0] * dx + axis[1] * dy + axis[2] * dz) / distance
+            cos_l = (points[k, 3] * dx + points[k, 4] * dy + points[k, 5] * dz) / distance
+            if cos_e <= 0.0 or cos_l <= 0.0:
+                continue
+            if near:
+                s = (height - z) / dz
+                if _enters(x, y, s * dx, s * dy, ring, ends, slits, buffer) < 1.0:
+                    continue
+            total += cos_e ** lobe * cos_l / square * sources[e, 3]
+        out[k] = total
+    return out
+
+
+class RingRenderer:
+    """Pictures of one target under one head.
+
+    :param solid: the target as it really is.
+    :param where: the target as it really lies.
+    :param head: the head as it really is.
+    :param sensor: the camera behind the lens.
+    :param scale: picture size relative to the head's camera.
+    :param seed: of the noise.
+    """
+
+    def __init__(self, solid: RingSolid, where: Placement, head: HeadModel,
+                 sensor: Sensor | None = None, scale: float = 1.0, seed: int = 1) -> None:
+        self.head, self.sensor, self.seed = head, sensor or Sensor(), seed
+        self.camera = scaled_camera(head.camera, round(head.camera.width_px * scale),
+                                    round(head.camera.height_px * scale))
+        self._where = where
+        self._ring = np.array([*solid.radii, solid.height, solid.slit_width / 2])
+        self._ends = np.array([f(a) for a in solid.arc for f in (math.cos, math.sin)])
+        self._slits = np.array([[math.cos(a), math.sin(a)] for a in solid.slits]).reshape(-1, 2)
+        shape = (self.camera.height_px, self.camera.width_px)
+        v, u = np.mgrid[:shape[0], :shape[1]]
+        rays = pixel_rays(self.camera, np.stack([u, v], axis=-1)).reshape(-1, 3)
+        with KERNEL_LOCK:
+            self._points = _look(
+                (camera_center(self.camera) - where.position) @ where.rotation,
+                rays @ where.rotation, self._ring, self._ends, self._slits,
+                np.array(solid.plate), np.asarray(solid.dots, np.float64), solid.dot_radius,
+                np.array(solid.reflectance), self.camera.camera_standoff / self.camera.fx)
+        self._shape = shape
+        y, x = np.ogrid[-1:1:shape[0] * 1j, -1:1:shape[1] * 1j]
+        self._gain = (1 - self.sensor.vignetting * (x * x + y * y) / 2).astype(np.float32)
+
+    def panel_radiance(self, pose: PanelPose) -> NDArray:
+        """Radiance towards the camera under one panel, (H, W) float32, without noise."""
+        where = self._where
+
+        def seen(count: tuple[int, int], gauss: bool) -> NDArray:
+            samples = emitters(pose, count, gauss)[0]
+            samples[:, :3] = (samples[:, :3] - where.position) @ where.rotation
+            return samples
+
+        u, v = np.meshgrid(*(np.linspace(-side / 2, side / 2, count)
+                             for side, count in zip(pose.size, _PROBES, strict=True)))
+        probes = (pose.center + u[..., None] * pose.right
+                  + v[..., None] * np.cross(pose.axis, pose.right)).reshape(-1, 3)
+        with KERNEL_LOCK:
+            irradiance = _light(
+                self._points, seen(_FREE, True),
+                (probes - where.position) @ where.rotation, seen(_SHADOWED, False),
+                pose.axis @ where.rotation, pose.lobe_exponent, self._ring, self._ends,
+                self._slits)
+        radiance = irradiance * self._points[:, 6] * pose.intensity / math.pi
+        return radiance.astype(np.float32).reshape(self._shape)
+
+    def capture(self, tilt: float, exposure: float = 1.0) -> list[NDArray]:
+        """The six pictures of a calibration: E, N, W, S, ALL at a quarter exposure, NONE.
+
+        :param tilt: of the bright-field panels, rad.
+        :param exposure: of the single-light pictures, relative to the sensor's own.
+        """
+        kinematics = BrightFieldKinematics(self.head)
+        panels = [self.panel_radiance(kinematics.panel_pose(name, tilt))  # type: ignore[arg-type]
+                  for name in DIRECTIONS]
+        levels = [*panels, 0.25 * np.sum(panels, axis=0), np.zeros(self._shape, np.float32)]
+        room = (self.sensor.ambient * self._points[:, 6]).reshape(self._shape)
+        pictures = []
+        for frame, level in enumerate(levels):
+            room_time = 0.25 if frame == 4 else 1.0
+            total = exposure * (level * (_LEVEL / _REFERENCE_RADIANCE) + room_time * room)
+            pictures.append(self.sensor.expose(
+                (total * self._gain).astype(np.float32), 0.0,
+                np.random.default_rng([self.seed, frame])))
+        return pictures

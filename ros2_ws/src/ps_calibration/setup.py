@@ -24,6 +24,7 @@ setup(
     entry_points={
         'console_scripts': [
             'ring_calibration = ps_calibration.nodes.ring_calibration:main',
+            'ps_calibrate = ps_calibration.cli.ps_calibrate:main',
         ],
     },
 )

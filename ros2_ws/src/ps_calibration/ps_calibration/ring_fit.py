@@ -28,7 +28,9 @@ _TILT_PRIOR = 0.03                       # rad, error of the motor between two p
 _STEPS = np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3])        # of finite differences
 _POSE_STEPS = np.array([1e-5, 1e-5, 1e-5, 1e-3, 5e-4, 5e-4])
 _HEIGHT_STEP, _TILT_STEP = 2e-5, 1e-3
-_SHARE_NOISE, _DOT_NOISE_PX = 0.002, 0.006
+# the dots weigh more than their noise asks for: small errors of the light's model, the same in
+# thousands of blocks, must not tilt the plane
+_SHARE_NOISE, _DOT_NOISE_PX = 0.002, 0.001
 _CLEAR = 0.0006          # m; the camera looks past the wall's edge, and a block has a width
 _BLOCK = 1.6e-4          # m on the plate, edge of the blocks of pixels that are averaged
 _REACH = 0.006           # m; no shadow is longer; beyond, a few blocks are enough

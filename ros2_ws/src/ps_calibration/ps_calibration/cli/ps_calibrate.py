@@ -1,0 +1,82 @@
+"""ps_calibrate: ring calibration from folders of pictures, without a graph."""
+import argparse
+import json
+from pathlib import Path
+import sys
+
+import numpy as np
+
+from ps_calibration.calibrate import Calibration, calibrate, head_calibration
+from ps_calibration.ring_target import default_target_path, load_target
+from ps_head_driver.calibration_file import write_calibration
+from ps_head_driver.errors import PsError
+from ps_head_driver.head_model import DIRECTIONS, HeadModel, load_head, nominal_head_path
+from ps_head_driver.stack_folder import read_stack
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='ps_calibrate', formatter_class=argparse.RawDescriptionHelpFormatter,
+        description='Calibrate the bright-field panels from pictures of the half-ring target. '
+                    'Each folder is a stack folder at one motor position with the frames E, N, '
+                    'W, S, ALL and NONE.',
+        epilog='example: ps_calibrate pictures/m25000 pictures/m30000 --out calibration.yaml')
+    parser.add_argument('folders', nargs='+', type=Path, metavar='FOLDER')
+    parser.add_argument('--target', type=Path, metavar='YAML', help='target file (default: the '
+                        'half ring shipped with this package)')
+    parser.add_argument('--head', type=Path, metavar='YAML', help='head file (default: nominal)')
+    parser.add_argument('--out', type=Path, metavar='YAML', help='calibration file to write')
+    parser.add_argument('--serial', default='', help='serial number of the head, for the file')
+    parser.add_argument('--json', type=Path, metavar='FILE', help='machine-readable result')
+    return parser
+
+
+def as_json(result: Calibration, head: HeadModel, folders: list[Path]) -> dict:
+    """The result under the names of the documentation; null for what a failure left unknown."""
+    fit, homography = result.fit, result.camera_to_plane()
+    listed = []
+    for k, panels in enumerate(result.panels(head)):
+        mean = float(np.mean([panel.intensity for panel in panels]))
+        listed.append({'folder': str(folders[k]), 'lights': [
+            {'panel': name, 'position': panel.center.tolist(), 'axis': panel.axis.tolist(),
+             'intensity': panel.intensity / mean,
+             'shadow_residual_px': float(fit.edge_px[k][i]) if fit else None}
+            for i, (name, panel) in enumerate(zip(DIRECTIONS, panels, strict=True))]})
+    return {
+        'verdict': result.verdict, 'reason': result.reason, 'folders': listed,
+        'plane': fit and {'normal': list(fit.pose.plane.normal),
+                          'offset': fit.pose.plane.offset},
+        'z_scale': result.z_scale if fit else None,
+        'camera_to_plane': None if homography is None else homography.tolist(),
+        'timings_s': result.timings_s}
+
+
+def main() -> None:
+    """Run the command line."""
+    arguments = _parser().parse_args()
+    try:
+        head = load_head(arguments.head or nominal_head_path())
+        target = load_target(arguments.target or default_target_path())
+        result = calibrate([read_stack(folder)[0] for folder in arguments.folders], target, head)
+        if arguments.json:
+            arguments.json.write_text(
+                json.dumps(as_json(result, head, arguments.folders), indent=2) + '\n')
+        if result.verdict != 'FAILED' and arguments.out:
+            write_calibration(head_calibration(result, head, target, arguments.serial),
+                              arguments.out)
+    except PsError as error:
+        sys.exit(f'ps_calibrate: {error.code.name}: {error.message}')
+    except OSError as error:
+        sys.exit(f'ps_calibrate: {error.filename}: {error.strerror}')
+    if result.verdict == 'FAILED':
+        sys.exit(f'ps_calibrate: FAILED: {result.reason}')
+    print(f'{result.verdict} {result.reason}'.strip())
+    for panels in result.panels(head):
+        for name, panel in zip(DIRECTIONS, panels, strict=True):
+            x, y, z = panel.center * 1e3
+            print(f'panel {name}  at ({x:.2f}, {y:.2f}, {z:.2f}) mm')
+    print(f'z scale  {result.z_scale:.4f}')
+
+
+if __name__ == '__main__':
+    main()

@@ -1,9 +1,12 @@
 """Reference firmware: the C core against the vectors, the emulator's tests and the real link."""
 from collections.abc import Callable, Iterator
 import ctypes
+from dataclasses import replace
 import os
 from pathlib import Path
+import random
 import shutil
+import struct
 import subprocess
 import threading
 import time
@@ -25,9 +28,11 @@ from ps_head_driver.protocol import (
     Fault,
     FrameDecoder,
     Packet,
+    Result,
     Status,
     StatusFlag,
     Step,
+    StepRecord,
     encode,
 )
 from ps_head_driver.serial_link import SerialLink
@@ -207,6 +212,50 @@ def test_servo_and_stop(bench: FirmwareBench) -> None:
     status = bench.status()
     assert (status.end, status.steps_done, status.strobe_counter) == (End.STOPPED, 0, 1)
     assert bench.host.lit == 0
+
+
+def random_request(chance: random.Random) -> tuple[Command, bytes]:
+    """A command with a body that is sensible more often than not."""
+    command = chance.choice([c for c in Command if c is not Command.HELLO])
+    if chance.random() < 0.1:
+        return command, chance.randbytes(chance.randrange(20))
+    step = Step(chance.randrange(256), chance.choice((0, 20000, FULL_LEVEL)),
+                chance.randrange(3000), chance.choice((0, 1000, 30_000, 5_000_000)),
+                chance.randrange(40_000), chance.random() < 0.8).pack()
+    return command, {
+        Command.LIMITS: struct.pack('<ii', chance.choice((-400, 900)), chance.choice((800, 9000))),
+        Command.MOVE: struct.pack('<iI', chance.randrange(-1000, 10000), chance.randrange(90000)),
+        Command.SERVO: struct.pack('<H', chance.randrange(40000)),
+        Command.GAINS: struct.pack('<8H', *(chance.randrange(65536) for _ in range(8))),
+        Command.STEPS: bytes([chance.choice((0, 0, 1, 2, 4))]) + step * chance.randint(1, 3),
+        Command.START: bytes([chance.randint(0, 4)]),
+        Command.RECORD: bytes([chance.randrange(4)]),
+    }.get(command, b'')
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_firmware_and_emulator_answer_alike(
+        built: Path, monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    monkeypatch.setattr(FirmwareBench, 'library', built / 'libhead.so', raising=False)
+    benches = FirmwareBench(), test_emulator.Bench(backlash=0.0)
+    chance, results = random.Random(seed), set()
+    for bench in benches:
+        bench.home()
+    for _ in range(400):
+        command, body = random_request(chance)
+        (code, reply), (wanted, wanted_reply) = (bench.ask(command, body) for bench in benches)
+        assert code is wanted, command
+        results.add(code)
+        if command is Command.RECORD and code is Result.OK:
+            record, model = StepRecord.parse(reply), StepRecord.parse(wanted_reply)
+            assert replace(record, time_us=0) == replace(model, time_us=0)
+        if command in (Command.HOME, Command.MOVE, Command.START, Command.STOP):
+            if command in (Command.HOME, Command.MOVE) and chance.random() < 0.3:
+                continue                  # the next request finds it busy
+            states = [bench.wait_idle() for bench in benches]
+            assert len({(s.end, s.flags, s.faults, s.steps_done, s.strobe_counter,
+                         s.trigger_counter) for s in states}) == 1, states
+    assert len(results) >= 6
 
 
 # ---------------------------------------------------------------------------- real clock

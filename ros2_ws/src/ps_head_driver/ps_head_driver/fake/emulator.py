@@ -21,6 +21,9 @@ from ps_head_driver.protocol import (
     REPLY,
     SERVO_REQUEST,
     START_REQUEST,
+    STEP,
+    STEPS_HEAD,
+    STEPS_PER_PACKET,
     TILT_UNIT,
     VERSION,
     Activity,
@@ -31,7 +34,6 @@ from ps_head_driver.protocol import (
     Fault,
     FrameDecoder,
     Packet,
-    ProtocolError,
     Result,
     Status,
     StatusFlag,
@@ -51,6 +53,8 @@ _LENGTHS = {
     Command.SERVO: SERVO_REQUEST.size, Command.GAINS: GAINS_REQUEST.size,
     Command.START: START_REQUEST.size, Command.RECORD: RECORD_REQUEST.size,
     Command.CLEAR_FAULT: 0}
+_STEPS_LENGTHS = tuple(
+    STEPS_HEAD.size + count * STEP.size for count in range(1, STEPS_PER_PACKET + 1))
 _NEEDS = {
     Command.LIMITS: Capability.MOTOR, Command.HOME: Capability.MOTOR,
     Command.MOVE: Capability.MOTOR, Command.SERVO: Capability.LIGHTS,
@@ -236,7 +240,8 @@ class Board:
             command = Command(packet.type)
         except ValueError:
             return self._reply(packet, Result.UNKNOWN_COMMAND)
-        if len(packet.body) != _LENGTHS.get(command, len(packet.body)):
+        if len(packet.body) not in (
+                _STEPS_LENGTHS if command is Command.STEPS else (_LENGTHS[command],)):
             return self._reply(packet, Result.BAD_LENGTH)
         if command in _NEEDS and _NEEDS[command] not in self.info.capabilities:
             return self._reply(packet, Result.UNSUPPORTED)
@@ -317,10 +322,7 @@ class Board:
         return Result.OK, b''
 
     def _do_steps(self, body: bytes) -> tuple[Result, bytes]:
-        try:
-            first, steps = parse_steps(body)
-        except ProtocolError:
-            return Result.BAD_LENGTH, b''
+        first, steps = parse_steps(body)
         program = [] if first == 0 else self.lights.program
         if first != len(program) or first + len(steps) > MAX_STEPS:
             return Result.REJECTED, b''

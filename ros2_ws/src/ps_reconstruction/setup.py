@@ -24,6 +24,7 @@ setup(
     entry_points={
         'console_scripts': [
             'reconstruction = ps_reconstruction.nodes.reconstruction:main',
+            'ps_diligent = ps_reconstruction.cli.ps_diligent:main',
             'ps_reconstruct = ps_reconstruction.cli.ps_reconstruct:main',
         ],
     },

@@ -60,7 +60,8 @@ def departures(coefficients: NDArray, x: NDArray, h: NDArray) -> NDArray:
     gloss = sum(c[6 + k] / (1 + tangent / LOBES[k]) ** 2 for k in range(len(LOBES)))
     factor = (1 + c[0] * u + c[1] * u ** 2 + c[2] * u ** 3 + c[3] * v + c[4] * v ** 2
               + c[5] * u * v + gloss / x)
-    return np.maximum(factor, LEAST_FACTOR)
+    limited: NDArray = np.maximum(factor, LEAST_FACTOR)
+    return limited
 
 
 @numba.njit(nogil=True, cache=True)
@@ -102,8 +103,8 @@ def add_equation(a, b, direction, weight, value):    # type: ignore[no-untyped-d
 
 
 @numba.njit(nogil=True, cache=True)
-def normal_equations(values, directions, halves, usable, scaled_normals, coefficients,
-                     darkest, low, high, huber):    # type: ignore[no-untyped-def]
+def normal_equations(values, directions, halves, usable, scaled_normals, coefficients,    # type: ignore[no-untyped-def]
+                     darkest, low, high, huber):
     """Information matrix (10, 10) and right side (10,) for a step of the coefficients.
 
     :param values: (T, P) intensity per irradiance of sample pixels.
@@ -175,6 +176,6 @@ def improved(coefficients: NDArray[np.float64], information: NDArray[np.float64]
              right: NDArray[np.float64]) -> NDArray[np.float64]:
     """One Gauss-Newton step of the coefficients with a ridge towards Lambert's law."""
     ridge = RIDGE * max(float(np.trace(information)) / TERMS, 1e-12)
-    step: NDArray[np.float64] = np.linalg.solve(
+    step: NDArray = np.linalg.solve(
         information + ridge * np.eye(TERMS), right - ridge * coefficients)
-    return coefficients + step
+    return np.asarray(coefficients + step, np.float64)

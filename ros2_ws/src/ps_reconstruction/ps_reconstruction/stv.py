@@ -49,7 +49,7 @@ class Trust(IntEnum):
 
     LEAST_SQUARES = 0         # the robust estimates predict the frames worse: keep LS
     REJECTION = 1             # reject shadows and highlights, Lambert's law for the rest
-    REFLECTANCE = 2           # also the object's own reflectance
+    REFLECTANCE = 2           # also the object's own reflectance, and Huber weights against it
 
 
 @dataclass(frozen=True)
@@ -144,8 +144,8 @@ def solve(problem: Problem, options: StvOptions | None = None, quality: bool = T
         length = np.empty((last - first, width), np.float32)
         confidence = np.empty((last - first, width), np.uint8)
         sums: tuple[float, float, int] = finish(
-            solved, tally[:, inner], mask[inner], problem.count, result.normal[first:last],
-            length, confidence, reason[inner])
+            solved, reference[:, inner], tally[:, inner], mask[inner], problem.count,
+            result.normal[first:last], length, confidence, reason[inner])
         if problem.colour:
             colour = np.einsum('thw,thwc->hwc', shading[:, inner], channels[:, inner])
             colour[np.isnan(length)] = np.nan
@@ -187,9 +187,10 @@ def plan(problem: Problem, options: StvOptions | None = None) -> Plan:
     coefficients, g = lambertian, g_first
     exact = [a.astype(np.float64) for a in (u, d, h)]
     for _ in range(ROUNDS):
-        coefficients = reflectance.improved(coefficients, *reflectance.normal_equations(
-            *exact, usable, g.astype(np.float64), coefficients, LEAST_COSINE,
-            LEAST_RATIO, MOST_RATIO, HUBER))
+        information, right = reflectance.normal_equations(
+            exact[0], exact[1], exact[2], usable, g.astype(np.float64), coefficients, LEAST_COSINE,
+            LEAST_RATIO, MOST_RATIO, HUBER)
+        coefficients = reflectance.improved(coefficients, information, right)
         g = estimated(coefficients, Trust.REFLECTANCE)
     misfit_ls = _misfit(u, d, h, g_ls, lambertian)
     level = {

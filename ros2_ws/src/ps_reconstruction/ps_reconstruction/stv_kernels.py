@@ -37,7 +37,8 @@ from ps_reconstruction.outliers import (
 from ps_reconstruction.problem import FEW_LIGHTS, HIGHLIGHT, MASKED, SATURATED, SHADOW
 
 BRIGHT_MARGIN = 0.1                       # of |g|: brighter than Lambert's law by this is gloss
-NOISE = 0.01                              # relative error of an intensity that is always there
+NOISE = 0.005                             # relative error of an intensity that is always there
+DISAGREEMENT = 0.115                      # expected error per difference to least squares
 ERROR_HALF = 0.04                         # expected error of a unit normal that halves confidence
 # Sums over the frames of a chunk: squared residuals, intensity, frames used, misfit
 SQUARES, LIGHT, USED, MISFIT = 0, CHUNK, 2 * CHUNK, 3 * CHUNK
@@ -47,8 +48,8 @@ SIDE = CHUNK + MAX_PATCH - 1                # of a chunk with its neighbours
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coefficients, rounds,
-                 rejecting, reflecting, reference, scaled, equations, shading, quality, reason):    # type: ignore[no-untyped-def]
+def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coefficients, rounds,    # type: ignore[no-untyped-def]
+                 rejecting, reflecting, reference, scaled, equations, shading, quality, reason):
     """Temporal weights, own estimate and normal equations of every pixel of a band.
 
     :param values: (T, h, W) intensities, before the flat field.
@@ -300,8 +301,11 @@ def add_neighbours(row, spatial, near, pixels, system):    # type: ignore[no-unt
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def finish(solved, quality, mask, count, normal, albedo, confidence, reason):    # type: ignore[no-untyped-def]
+def finish(solved, reference, quality, mask, count, normal, albedo, confidence, reason):    # type: ignore[no-untyped-def]
     """Unit normal, albedo and confidence of a band (paper, Eq. 7); returns the residual sums.
+
+    The confidence falls with the expected error: the misfit of the frames, more where few of them
+    are left and where the surface is seen at a grazing angle, and the distance to least squares.
 
     :param albedo: (h, W) out.
     :param confidence: (h, W) uint8 out.
@@ -331,7 +335,13 @@ def finish(solved, quality, mask, count, normal, albedo, confidence, reason):   
             brightness += quality[1, y, x]
             valid += 1
             used = max(quality[2, y, x], one)
-            error = (np.float32(NOISE) + quality[3, y, x]) * np.sqrt(np.float32(count) / used)
+            r0, r1, r2 = reference[0, y, x], reference[1, y, x], reference[2, y, x]
+            other = one / max(np.sqrt(r0 * r0 + r1 * r1 + r2 * r2), np.float32(1e-30))
+            d0, d1, d2 = (g0 * inverse - r0 * other, g1 * inverse - r1 * other,
+                          g2 * inverse - r2 * other)
+            error = ((np.float32(NOISE) + quality[3, y, x]) * np.sqrt(np.float32(count) / used)
+                     / max(g2 * inverse, np.float32(0.1))
+                     + np.float32(DISAGREEMENT) * np.sqrt(d0 * d0 + d1 * d1 + d2 * d2))
             certainty = one / (one + error / np.float32(ERROR_HALF))
             confidence[y, x] = max(1, int(np.float32(255) * certainty + np.float32(0.5)))
     return squares, brightness, valid

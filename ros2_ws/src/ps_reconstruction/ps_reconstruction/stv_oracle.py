@@ -132,7 +132,11 @@ def _compare(u: NDArray, d: NDArray, h: NDArray, usable: NDArray, g: NDArray, de
 
 def _patch(y: int, x: int, own: NDArray, kept: NDArray, reference: NDArray, intensity: NDArray,
            effective: NDArray, irradiance: NDArray, decided: Plan, options: StvOptions) -> NDArray:
-    """Eq. 6 at one pixel by iteratively reweighted least squares."""
+    """Eq. 6 at one pixel by iteratively reweighted least squares.
+
+    Normals differ within a patch by as much as the edge-aware weight tolerates; the Huber
+    threshold is wider by that, so that it judges frames and not the form of the surface.
+    """
     radius = options.patch // 2
     height, width = intensity.shape[:2]
     members = [(v, w) for v in range(max(0, y - radius), min(height, y + radius + 1))
@@ -148,7 +152,8 @@ def _patch(y: int, x: int, own: NDArray, kept: NDArray, reference: NDArray, inte
         matrix, right = np.zeros((3, 3)), np.zeros(3)
         for w_patch, q in zip(weight, members, strict=True):
             residual = (intensity[q] - effective[q] @ g) / irradiance[q]
-            row = w_patch * kept[q] * (_huber(residual, g, HUBER + tolerance) if reweighted else 1.0)
+            w_huber = _huber(residual, g, HUBER + tolerance) if reweighted else 1.0
+            row = w_patch * kept[q] * w_huber
             matrix += effective[q].T @ (row[:, None] * effective[q])
             right += effective[q].T @ (row * intensity[q])
         strength = options.ridge * np.trace(matrix) / 3

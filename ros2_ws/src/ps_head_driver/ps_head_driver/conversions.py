@@ -1,7 +1,8 @@
 """Messages to plain data and back: the only module of this package that knows both."""
 from array import array
+from collections.abc import Callable
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 from builtin_interfaces.msg import Time
 import cv2
@@ -16,6 +17,8 @@ from ps_head_driver.frames import OPTICAL_FRAME, PLANE_FRAME
 from ps_head_driver.head_model import CameraGeometry
 from ps_head_driver.stack import Geometry, Light, Mode, Panel, Plane, Pose, Stack, Vector
 from ps_interfaces import msg as ps
+
+T = TypeVar('T')
 
 # encoding: (dtype, channels)
 ENCODINGS: dict[str, tuple[str, int]] = {
@@ -135,9 +138,17 @@ def message_to_camera(info: CameraInfo, standoff: float) -> CameraGeometry | Non
                       f'camera_info: distortion model {info.distortion_model!r} is not supported; '
                       'use plumb_bob')
     d = (list(info.d) + [0.0] * 5)[:5]
-    return CameraGeometry(
+    return _checked(ErrorCode.SEQUENCER_BAD_IMAGE, 'camera_info', lambda: CameraGeometry(
         width_px=info.width, height_px=info.height, fx=info.k[0], fy=info.k[4], cx=info.k[2],
-        cy=info.k[5], distortion=(d[0], d[1], d[2], d[3], d[4]), camera_standoff=standoff)
+        cy=info.k[5], distortion=(d[0], d[1], d[2], d[3], d[4]), camera_standoff=standoff))
+
+
+def _checked(code: ErrorCode, what: str, make: Callable[[], T]) -> T:
+    """Make a validated object; a message with impossible values becomes one line."""
+    try:
+        return make()
+    except (ValueError, OverflowError) as error:
+        raise PsError(code, f'{what}: {" ".join(str(error).split())}') from error
 
 
 # ---------------------------------------------------------------------------- lights
@@ -317,7 +328,7 @@ def message_to_calibration(message: ps.HeadCalibration) -> HeadCalibration | Non
         raise PsError(ErrorCode.CALIBRATION_BAD_REQUEST, 'calibration: camera_info is empty')
     verdicts: dict[int, Verdict] = {
         ps.HeadCalibration.VERDICT_OK: 'OK', ps.HeadCalibration.VERDICT_POOR: 'POOR'}
-    return HeadCalibration(
+    return _checked(ErrorCode.CALIBRATION_BAD_REQUEST, 'calibration', lambda: HeadCalibration(
         calibration_id=message.calibration_id,
         created=datetime.fromtimestamp(time_to_ns(message.created) / 1e9, UTC),
         head_serial=message.head_serial, camera=camera,
@@ -328,4 +339,4 @@ def message_to_calibration(message: ps.HeadCalibration) -> HeadCalibration | Non
             for p in message.panels},
         backlash_counts=message.backlash_counts, z_scale=message.z_scale,
         verdict=verdicts.get(message.verdict, 'FAILED'), verdict_reason=message.verdict_reason,
-        target_name=message.target_name)
+        target_name=message.target_name))

@@ -52,6 +52,7 @@ class Settings:
     home_on_connect: bool = True
     status_period: float = 0.5        # s
     reconnect_period: float = 0.25    # s
+    move_timeout: float = 30.0        # s, of the homing after connecting
 
 
 class HeadSupervisor:
@@ -221,6 +222,12 @@ class HeadSupervisor:
                 self._error = error
                 if error.code is ErrorCode.HEAD_LINK_TIMEOUT:
                     self.client.disconnect()      # a board that is silent needs a new hello
+            except (ValueError, OSError) as error:
+                # an answer that makes no sense, or a fake head that cannot be started
+                self._error = PsError(ErrorCode.HEAD_PROTOCOL_MISMATCH
+                                      if isinstance(error, ValueError) else
+                                      ErrorCode.HEAD_DISCONNECTED, str(error))
+                self.client.disconnect()
             self._announce(always=not self.client.connected)
             connected = self.client.connected
             self._wake.wait(self.settings.status_period if connected
@@ -233,6 +240,8 @@ class HeadSupervisor:
             with self._busy:
                 self._state = None
                 self._prepare()
+                if self._closing:
+                    return
                 self._connect()
         if self._busy.locked():
             return                                # the operation that runs reads the state itself
@@ -241,7 +250,7 @@ class HeadSupervisor:
             self.client.clear_fault()             # its cause, our silence, is over
         if self._home_wanted and not state.homed and not state.faults:
             with self._alone():
-                self._home(self.client, 30.0)
+                self._home(self.client, self.settings.move_timeout)
 
     def _connect(self) -> HeadState:
         self._home_wanted = False

@@ -134,14 +134,26 @@ class CellClient:
         finally:
             self.node.destroy_client(client)
         if not response.success:
-            raise PsError(getattr(response, 'error_code', ErrorCode.HEAD_FAULT), response.message)
+            raise _error_of(response)
         return response
 
     def home(self) -> None:
         """Home the motor and wait until the head is ready."""
-        self.call(Trigger, 'head_driver/home', timeout=60.0)
-        self.wait(lambda: self.status is not None and self.status.state == ps.HeadStatus.READY,
-                  10.0, 'READY in head_status')
+        try:
+            self.call(Trigger, 'head_driver/home', timeout=60.0)
+        except PsError as error:
+            # the driver homes by itself when it connects: that is as good
+            if error.code is not ErrorCode.HEAD_BUSY:
+                raise
+        self.wait_until_ready(60.0)
+
+    def wait_until_ready(self, timeout: float) -> None:
+        """Wait until the head is homed and idle.
+
+        :raises PsError: RECONSTRUCTION_TIMEOUT.
+        """
+        self.wait(lambda: self.status is not None and self.status.homed
+                  and self.status.state == ps.HeadStatus.READY, timeout, 'READY in head_status')
 
     def solve(self, convergence_radius: float) -> srv.SolveConvergenceRadius.Response:
         """Ask which motor position gives a convergence radius (m)."""
@@ -195,3 +207,13 @@ class CellClient:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
         self.close()
+
+
+def _error_of(response: Any) -> PsError:
+    """Error of an answer; std_srvs/Trigger has no code, so its message begins with the name."""
+    if hasattr(response, 'error_code'):
+        return PsError(response.error_code, response.message)
+    name, _, message = response.message.partition(': ')
+    code = ErrorCode.__members__.get(name)
+    return PsError(code, message) if code is not None else PsError(
+        ErrorCode.HEAD_FAULT, response.message)

@@ -8,6 +8,7 @@ graph.
 from collections.abc import Callable
 from dataclasses import dataclass, field
 import json
+import os
 from pathlib import Path
 import time
 from typing import Any
@@ -60,7 +61,8 @@ class DemoOptions:
     scene: str = 'disc'
     input_folder: Path | None = None
     convergence_radius: float = 0.060
-    namespace: str = 'ps_head'
+    # its own: the demo must never meet a real head that is running under the default name
+    namespace: str = field(default_factory=lambda: f'ps_demo_{os.getpid()}')
 
 
 @dataclass
@@ -103,9 +105,12 @@ def run(options: DemoOptions, progress: Callable[[str], None]) -> DemoResult:
             cell.start()
         with CellClient(options.namespace, OUTPUTS) as client:
             stack_message, info, images = _inspect(client, options, result, step)
+        cell.check()
     finally:
         with step('stop the cell'):
-            cell.stop()
+            unclean = cell.stop()
+    if unclean:
+        result.wrong.append(f'did not stop cleanly: {", ".join(unclean)}')
 
     progress('write pictures and report')
     _write(options, result, stack_message, info, images)

@@ -149,7 +149,7 @@ class Cell:
     def stop(self) -> list[str]:
         """Stop all nodes, the head last: whoever is using it can still switch its panels off.
 
-        :returns: names of the nodes that had to be killed.
+        :returns: names of the nodes that had to be killed or ended with an error.
         """
         others = [n for n in self.processes if n.name != HEAD_DRIVER.executable]
         head = [n for n in self.processes if n.name == HEAD_DRIVER.executable]
@@ -266,5 +266,6 @@ def _stop(nodes: Sequence[NodeProcess], grace: float) -> list[str]:
         # its group: helpers that a node left behind must not outlive the cell
         with contextlib.suppress(ProcessLookupError):
             os.killpg(node.process.pid, signal.SIGKILL)
-        node.process.wait()
+        if node.process.wait() not in (0, -signal.SIGKILL) and node.name not in killed:
+            killed.append(node.name)
     return killed

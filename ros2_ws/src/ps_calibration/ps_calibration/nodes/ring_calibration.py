@@ -34,6 +34,7 @@ class RingCalibration(Node):
         self.folder = Path(self.parameters['calibration_folder']).expanduser()
         self.active: HeadCalibration | None = None
         self.reported_serial = ''
+        self.refused = ''      # why the calibration of the start was dropped
         self._publisher = self.create_publisher(
             ps.HeadCalibration, 'calibration', ros_support.LATCHED)
         self.create_subscription(
@@ -47,11 +48,19 @@ class RingCalibration(Node):
         ros_support.Diagnostics(self, {'Calibration': self._diagnose},
                                 hardware_id=lambda: self.reported_serial)
         if self.parameters['calibration_file']:
-            self.active = read_calibration(self._path(self.parameters['calibration_file']))
+            self._activate(self._path(self.parameters['calibration_file']))
         self._publish()
 
     def _on_head_status(self, message: ps.HeadStatus) -> None:
         self.reported_serial = message.serial_number or self.reported_serial
+        try:
+            if self.active is not None:
+                self._check_serial(self.active)
+        except PsError as error:
+            # loaded before the head had said who it is
+            self.get_logger().error(f'{error.message}; nominal geometry is active instead')
+            self.active, self.refused = None, error.message
+            self._publish()
 
     def _path(self, name: str) -> Path:
         """File of a request.
@@ -84,18 +93,30 @@ class RingCalibration(Node):
     def _on_load(self, request: CalibrationFile.Request,
                  response: CalibrationFile.Response) -> str:
         path = self._path(request.file)
+        self._activate(path)
+        self._publish()
+        assert self.active is not None
+        response.calibration_id = self.active.calibration_id
+        return f'{path} is active'
+
+    def _activate(self, path: Path) -> None:
+        """Read a file and make it active; what was active before stays if it is refused.
+
+        :raises PsError: CALIBRATION_* with the reason.
+        """
         calibration = read_calibration(path)
-        ours = self.parameters['head_serial'] or self.reported_serial
-        if ours and calibration.head_serial != ours:
-            raise PsError(ErrorCode.CALIBRATION_WRONG_HEAD,
-                          f'{path}: made for head {calibration.head_serial!r}, this is {ours!r}')
+        self._check_serial(calibration)
         if calibration.verdict == 'FAILED':
             raise PsError(ErrorCode.CALIBRATION_FILE_INVALID,
                           f'{path}: this calibration failed: {calibration.verdict_reason}')
-        self.active = calibration
-        self._publish()
-        response.calibration_id = calibration.calibration_id
-        return f'{path} is active'
+        self.active, self.refused = calibration, ''
+
+    def _check_serial(self, calibration: HeadCalibration) -> None:
+        ours = self.parameters['head_serial'] or self.reported_serial
+        if ours and calibration.head_serial != ours:
+            raise PsError(ErrorCode.CALIBRATION_WRONG_HEAD,
+                          f'calibration {calibration.calibration_id} was made for head '
+                          f'{calibration.head_serial!r}, this is {ours!r}')
 
     def _on_calibrate(self, goal: ServerGoalHandle) -> CalibrateRing.Result:
         result = CalibrateRing.Result(verdict=ps.HeadCalibration.VERDICT_FAILED)
@@ -111,6 +132,8 @@ class RingCalibration(Node):
         self._publisher.publish(calibration_to_message(self.active))
 
     def _diagnose(self) -> ros_support.Report:
+        if self.refused:
+            return ros_support.ERROR, self.refused, {}
         if self.active is None:
             return ros_support.WARN, 'not calibrated: nominal geometry', {}
         level = ros_support.OK if self.active.verdict == 'OK' else ros_support.WARN

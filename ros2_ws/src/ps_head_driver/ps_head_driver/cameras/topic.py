@@ -1,7 +1,6 @@
 """Topic camera: any ROS camera driver that is triggered by the board and stamps its frames."""
 from collections.abc import Sequence
 import threading
-import time
 
 import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -70,9 +69,8 @@ class TopicCamera(Camera):
             self._node.get_logger().warning(error.message, throttle_duration_sec=10.0)
 
     def _on_image(self, message: Image) -> None:
-        host_time_ns = time.time_ns()
         with self._arrived:
-            index = len(self._frames)
+            index, stamp_ns = len(self._frames), time_to_ns(message.header.stamp)
             self._counter += 1
             if not self._armed:
                 return
@@ -84,7 +82,7 @@ class TopicCamera(Camera):
                 exposure = self._exposures[min(index, len(self._exposures) - 1)]
                 self._frames.append(Frame(
                     image=image, frame_counter=self._counter, trigger_counter=None,
-                    device_time_ns=time_to_ns(message.header.stamp), host_time_ns=host_time_ns,
+                    device_time_ns=stamp_ns, host_time_ns=stamp_ns,
                     exposure_time=exposure, gain=self._gain))
             self._arrived.notify_all()
 

@@ -15,6 +15,7 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from ps_head_driver import convergence_radius, ros_support, sequence
 from ps_head_driver.calibration_file import HeadCalibration, apply
@@ -80,13 +81,19 @@ class _Flat:
     lights: list[Light]
     gain_maps: list[np.ndarray]
 
-    def for_lights(self, lights: list[Light], tolerance_counts: int) -> list[np.ndarray]:
-        """Gain maps in the order of the lights, or an empty list if one light is not covered."""
+    def for_lights(self, lights: list[Light], tolerance_counts: int,
+                   tolerance_tilt: float) -> list[np.ndarray]:
+        """Gain maps in the order of the lights, or an empty list if one light is not covered.
+
+        The stored maps are per unit intensity; what is returned is for the intensity of now.
+        """
         maps = []
         for light in lights:
-            found = [gain for own, gain in zip(self.lights, self.gain_maps, strict=True)
+            found = [gain * np.float32(np.mean(light.intensity))
+                     for own, gain in zip(self.lights, self.gain_maps, strict=True)
                      if (own.mode, own.panel) == (light.mode, light.panel)
-                     and abs(own.motor_counts - light.motor_counts) <= tolerance_counts]
+                     and abs(own.motor_counts - light.motor_counts) <= tolerance_counts
+                     and abs(own.tilt - light.tilt) <= tolerance_tilt]
             if not found:
                 return []
             maps.append(found[0])
@@ -108,6 +115,7 @@ class CameraSequencer(Node):
 
     # positions within this many counts count as the same illumination for a flat field
     FLAT_TOLERANCE_COUNTS = 40
+    FLAT_TOLERANCE_TILT = 2e-3     # rad
 
     def __init__(self) -> None:
         super().__init__('camera_sequencer')
@@ -121,6 +129,7 @@ class CameraSequencer(Node):
         self.captures = self.failures = 0
         self.last_error = ''
         self._busy = threading.Lock()
+        self._running: ServerGoalHandle | None = None
         self._cancel = threading.Event()
         self.camera: Camera = make_camera(self.parameters['camera'], CameraSettings(
             node=self, head=self.head, parameters=self.parameters))
@@ -145,6 +154,7 @@ class CameraSequencer(Node):
             SetIllumination, 'set_illumination', callback_group=clients)
         self._run_program = self.create_client(
             RunStrobeProgram, 'head_driver/run_strobe_program', callback_group=clients)
+        self._stop = self.create_client(Trigger, 'head_driver/stop', callback_group=clients)
         self.create_service(Capture, 'capture', self._on_capture, callback_group=parallel)
         self.create_service(CaptureFlat, 'capture_flat', self._on_flat, callback_group=parallel)
         self._action = ActionServer(
@@ -163,10 +173,18 @@ class CameraSequencer(Node):
     def _on_session(self, message: String) -> None:
         self.session_id = message.data
 
-    def _on_cancel(self, _goal: ServerGoalHandle) -> CancelResponse:
-        self._cancel.set()
-        self.camera.cancel()
+    def _on_cancel(self, goal: ServerGoalHandle) -> CancelResponse:
+        # a goal that is not running yet looks at its own flag when it gets its turn
+        if self._running is not None and self._running.goal_id == goal.goal_id:
+            self._cancel.set()
+            self.camera.cancel()
+            self._stop_head()
         return CancelResponse.ACCEPT
+
+    def _stop_head(self) -> None:
+        """Panels off and motor stopped; does not wait for the answer."""
+        if self._stop.service_is_ready():
+            self._stop.call_async(Trigger.Request())
 
     # ------------------------------------------------------------------ requests
 
@@ -195,7 +213,7 @@ class CameraSequencer(Node):
             rounds[0].ambient.image if rounds[0].ambient else None,
             self.parameters['flat_height']) for i in range(len(lights))]
         for i, light in enumerate(lights):
-            gains[i] /= exposure(light)
+            gains[i] /= exposure(light) * float(np.mean(light.intensity))
         peak = max(float(gain.max()) for gain in gains)
         self.flat = _Flat(_new_id('flat'), lights, [gain / peak for gain in gains])
         response.flat_id = self.flat.flat_id
@@ -204,7 +222,7 @@ class CameraSequencer(Node):
     def _on_acquire(self, goal: ServerGoalHandle) -> AcquireStack.Result:
         request, result = goal.request, AcquireStack.Result()
         try:
-            with self._exclusive():
+            with self._exclusive(goal):
                 stack, taken = self._capture(
                     self._recipe_of(request), request.part_id, message_to_pose(request.head_pose),
                     lambda *progress: self._feedback(goal, *progress))
@@ -225,8 +243,11 @@ class CameraSequencer(Node):
     def _recipe_of(self, request: AcquireStack.Goal) -> sequence.Recipe:
         if not request.steps:
             recipe = self.recipes.get(request.recipe)
-            return recipe.model_copy(update={'ambient': True}) if request.ambient_frame else recipe
+            if not request.ambient_frame:
+                return recipe
         try:
+            if not request.steps:
+                return sequence.Recipe.model_validate({**recipe.model_dump(), 'ambient': True})
             modes, panels = ('BRIGHT_FIELD', 'DARK_FIELD', 'BOTH'), tuple(Panel.__members__)
             steps = [{
                 'mode': modes[step.mode], 'panel': panels[step.panel],
@@ -244,14 +265,18 @@ class CameraSequencer(Node):
             state=state, frames_acquired=frames, safe_to_move=safe_to_move))
 
     @contextmanager
-    def _exclusive(self) -> Iterator[None]:
+    def _exclusive(self, goal: ServerGoalHandle | None = None) -> Iterator[None]:
         """One capture at a time; a second one is refused, not queued."""
         if not self._busy.acquire(blocking=False):
             raise PsError(ErrorCode.SEQUENCER_BUSY, 'another capture is running; try again later')
         try:
             self._cancel.clear()
+            self._running = goal
+            if goal is not None and goal.is_cancel_requested:
+                self._cancel.set()
             yield
         finally:
+            self._running = None
             self._busy.release()
 
     # ------------------------------------------------------------------ capture
@@ -264,25 +289,23 @@ class CameraSequencer(Node):
         stack_id = _new_id('stack')
         done_sent = False
 
-        def done(success: bool, code: int, message: str) -> None:
-            nonlocal done_sent
-            if not done_sent:
-                self._publish_done(stack_id, success, code, message)
-                done_sent = True
-
         def on_progress(state: int, frames: int, safe_to_move: bool) -> None:
-            if safe_to_move:
-                done(True, ErrorCode.NONE, 'ok')
+            nonlocal done_sent
+            if safe_to_move and not done_sent:
+                self._publish_done(stack_id, True, ErrorCode.NONE, 'ok')
+                done_sent = True
             progress(state, frames, safe_to_move)
 
         try:
             taken = self._acquire(recipe, on_progress)
             stack = self._assemble(taken, stack_id, part_id, pose)
-        except PsError as error:
+        except Exception as error:
+            known = ros_support.as_ps_error(self, error, ErrorCode.SEQUENCER_INTERNAL)
             self.failures += 1
-            self.last_error = f'{error.code.name}: {error.message}'
-            done(False, error.code, error.message)
-            raise
+            self.last_error = f'{known.code.name}: {known.message}'
+            # also after an early success: the exposures ended well, but no stack will follow
+            self._publish_done(stack_id, False, known.code, known.message)
+            raise known from error
         self._stack.publish(stack_to_message(stack))
         self.captures += 1
         self.last_error = ''
@@ -328,9 +351,8 @@ class CameraSequencer(Node):
                 arrived = self.camera.collect(len(shots), self.parameters['frame_timeout'])
                 self._check_cancelled()
                 matched = sequence.match(arrived, own, self.parameters['time_tolerance'])
-            except PsError:
+            finally:
                 self.camera.disarm()
-                raise
             frames += matched
             lights += [replace(light, frame_counter=frame.frame_counter)
                        for light, frame in zip(own, matched, strict=True)]
@@ -354,7 +376,11 @@ class CameraSequencer(Node):
             period=max(self.parameters['frame_period'], shot.exposure))
 
     def _ask_head(self, client: Any, request: Any, timeout: float) -> Any:
-        answer = call(client, request, timeout, ErrorCode.SEQUENCER_HEAD_UNAVAILABLE)
+        try:
+            answer = call(client, request, timeout, ErrorCode.SEQUENCER_HEAD_UNAVAILABLE)
+        except PsError:
+            self._stop_head()      # it may still be moving or flashing
+            raise
         if not answer.success:
             name = _code_name(answer.error_code)
             self._check_cancelled()
@@ -393,7 +419,8 @@ class CameraSequencer(Node):
         except PsError:
             pass     # the axes do not meet the plane: CR stays NaN, the stack is good all the same
         if self.flat is not None:
-            gains = self.flat.for_lights(taken.lights, self.FLAT_TOLERANCE_COUNTS)
+            gains = self.flat.for_lights(
+                taken.lights, self.FLAT_TOLERANCE_COUNTS, self.FLAT_TOLERANCE_TILT)
             if gains:
                 stack = replace(stack, gain_maps=gains, flat_id=self.flat.flat_id)
             else:

@@ -167,7 +167,8 @@ class HeadDriver(LifecycleNode):
         return Settings(
             Motion(values['speed'], values['overshoot'], values['approach'] == 'up',
                    values['in_position'], values['settle_time']),
-            values['home_on_activation'], values['status_period'], values['reconnect_period'])
+            values['home_on_activation'], values['status_period'], values['reconnect_period'],
+            values['move_timeout'])
 
     def _on_parameters(self, changes: dict[str, Any]) -> None:
         if self._supervisor is not None:

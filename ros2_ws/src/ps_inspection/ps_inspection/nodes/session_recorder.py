@@ -128,6 +128,10 @@ class SessionRecorder(Node):
                 done = deserialize_message(data, AcquisitionDone)
                 if done.success:
                     self._announced.add(done.stack_id)
+                else:
+                    # its frames were refused after all: no stack will come
+                    self._announced.discard(done.stack_id)
+                    self._change.notify_all()
             taken = self._writer.write(topic.name, data, time.time_ns(), sent, on_written)
         if not taken and on_written is not None and self._writer.error is None:
             self.get_logger().error(

@@ -93,7 +93,11 @@ class ReconstructionNode(Node):
     def _work(self) -> None:
         # compiled before the first stack comes, not while it waits
         start = time.perf_counter()
-        pipeline.warm_up()
+        try:
+            pipeline.warm_up()
+        except Exception as error:
+            # the stacks to come will say the same in their answers
+            ros_support.as_ps_error(self, error, ErrorCode.RECONSTRUCTION_INTERNAL)
         self.get_logger().info(f'ready, kernels compiled in {time.perf_counter() - start:.1f} s')
         while True:
             with self._wake:

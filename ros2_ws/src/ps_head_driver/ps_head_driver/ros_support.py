@@ -20,12 +20,16 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from ps_head_driver.errors import ErrorCode, PsError
 
 RELIABLE = QoSProfile(depth=4, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+# for topics with pictures: parameters qos_overrides.<topic>.<publisher|subscription>.<policy>
+OVERRIDABLE = QoSOverridingOptions.with_default_policies()
 
 
 # ---------------------------------------------------------------------------- parameters

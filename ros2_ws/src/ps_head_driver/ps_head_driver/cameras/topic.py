@@ -12,6 +12,7 @@ from ps_head_driver.cameras.base import Camera, Frame, Light
 from ps_head_driver.conversions import message_to_camera, message_to_image, time_to_ns
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import CameraGeometry
+from ps_head_driver.ros_support import OVERRIDABLE
 
 
 class TopicCamera(Camera):
@@ -46,7 +47,8 @@ class TopicCamera(Camera):
         info_topic = self._topic.rsplit('/', 1)[0] + '/camera_info'
         self._subscriptions = [
             self._node.create_subscription(
-                Image, self._topic, self._on_image, qos, callback_group=group),
+                Image, self._topic, self._on_image, qos, callback_group=group,
+                qos_overriding_options=OVERRIDABLE),
             self._node.create_subscription(
                 CameraInfo, info_topic, self._on_info, qos, callback_group=group)]
 

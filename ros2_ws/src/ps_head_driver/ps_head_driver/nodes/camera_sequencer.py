@@ -143,7 +143,9 @@ class CameraSequencer(Node):
 
         latched, reliable = ros_support.LATCHED, ros_support.RELIABLE
         parallel = ReentrantCallbackGroup()
-        self._stack = self.create_publisher(ps.PhotometricStack, 'stack', reliable)
+        self._stack = self.create_publisher(
+            ps.PhotometricStack, 'stack', reliable,
+            qos_overriding_options=ros_support.OVERRIDABLE)
         self._done = self.create_publisher(ps.AcquisitionDone, 'acquisition_done', reliable)
         self.create_subscription(
             ps.HeadCalibration, 'calibration', self._on_calibration, latched)

@@ -59,7 +59,8 @@ class ReconstructionNode(Node):
             self, PARAMETERS, ErrorCode.RECONSTRUCTION_BAD_PARAMETER, self._check_change)
         self._check_change({})
         self._images = {
-            name: self.create_publisher(Image, topic, ros_support.RELIABLE)
+            name: self.create_publisher(Image, topic, ros_support.RELIABLE,
+                                        qos_overriding_options=ros_support.OVERRIDABLE)
             for name, topic in IMAGE_TOPICS.items()}
         self._cameras = {
             name: self.create_publisher(
@@ -68,7 +69,8 @@ class ReconstructionNode(Node):
         self._info = self.create_publisher(
             ps.ReconstructionInfo, 'reconstruction_info', ros_support.LATCHED)
         self.create_subscription(
-            ps.PhotometricStack, 'stack', self._on_stack, ros_support.RELIABLE)
+            ps.PhotometricStack, 'stack', self._on_stack, ros_support.RELIABLE,
+            qos_overriding_options=ros_support.OVERRIDABLE)
         ros_support.Diagnostics(self, {'Reconstruction': self._diagnose})
         self._worker = threading.Thread(target=self._work, name='ps_reconstruction', daemon=True)
         self._worker.start()

@@ -4,20 +4,24 @@ CR is the diameter of the circle fitted to the four points in which the bright-f
 meet the measurement plane. CR(m) is not monotone: once the axes cross over the optical axis before
 they reach the plane, the points move outwards again.
 """
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ps_head_driver.circle_fit import fit_circles
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import DIRECTIONS, HeadModel
 from ps_head_driver.kinematics import BrightFieldKinematics
 
 # motor positions at which the inverse looks first; it refines between them
-_SAMPLES = 257
+_SAMPLES = 129
+# positions tried inside each of the intervals that the samples leave, until single counts
+_TRIES = 65
+# a fit with a larger residual (over the radius) may have a rival that fits as well
+_POOR = 0.05
 # an axis flatter than this does not meet the plane anywhere near the head
 _FLATTEST_AXIS = 1e-4
 
@@ -81,7 +85,6 @@ class CrSolver:
         if light_height is not None and not (np.isfinite(light_height) and light_height >= 0):
             raise PsError(ErrorCode.CR_BAD_REQUEST,
                           f'light_height: {light_height} is not a positive length in metres')
-        self._intervals: dict[Branch, tuple[float, float]] = {}
         self._motor = BrightFieldKinematics(head)
         at_home = self._axes(np.array([float(head.bright_field.slider.m0_counts)]))[0]
         # the paper's h is C_z at m_0: it says where the plane is, and the plane stays there
@@ -119,13 +122,19 @@ class CrSolver:
 
     def evaluate(self, m: NDArray) -> tuple[NDArray, NDArray]:
         """CR (NaN without intersection) and branch at motor positions."""
-        points, radial = self.intersections(m)
+        cr, branch, _ = self._circles(*self.intersections(m))
+        return cr, branch
+
+    def _circles(self, points: NDArray, radial: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """CR, branch, and rms distance from the circle over its radius."""
         branch = self._branches(radial)
-        cr = np.full(len(m), np.nan)
+        cr, poorness = np.full((2, len(points)), np.nan)
         good = branch > 0
         if good.any():
-            cr[good] = 2 * fit_circles(points[good])[1]
-        return cr, branch
+            _, radius, residual = fit_circles(points[good])
+            cr[good] = 2 * radius
+            poorness[good] = residual / np.maximum(radius, 1e-12)
+        return cr, branch, poorness
 
     # ------------------------------------------------------------------ forward
 
@@ -133,38 +142,34 @@ class CrSolver:
         """See :func:`forward`."""
         solution = self._at(m_counts)
         lowest, highest = self.reachable(solution.branch)
-        return CrSolution(**{**vars(solution), 'reachable': (lowest, highest)})
+        return replace(solution, reachable=(lowest, highest))
 
     def _at(self, m_counts: int) -> CrSolution:
-        m = np.array([float(m_counts)])
-        self._motor.check_counts(m)
+        """Everything but the reachable interval."""
+        self._motor.check_counts(m_counts)
+        low, high = self._motor.limits_counts
+        m = np.unique(np.clip(np.array([m_counts - 1.0, m_counts, m_counts + 1.0]), low, high))
+        here = int(np.searchsorted(m, m_counts))
         points, radial = self.intersections(m)
-        missing = [name for name, r in zip(DIRECTIONS, radial[0], strict=True) if np.isnan(r)]
+        missing = [name for name, r in zip(DIRECTIONS, radial[here], strict=True) if np.isnan(r)]
         if missing:
             raise PsError(ErrorCode.CR_NO_INTERSECTION,
                           f'the axis of panel {", ".join(missing)} does not meet the plane '
                           f'at m = {m_counts} (tilt {np.degrees(self._motor.tilt(m_counts)):.2f} '
                           'deg)')
-        center, radius, residual = fit_circles(points)
-        branch = Branch(int(self._branches(radial)[0]))
+        branches = self._branches(radial)
+        center, radius, residual = fit_circles(points[branches == branches[here]])
+        # Of the changes to both neighbours on the branch the smaller one: four points of a very
+        # asymmetric head may have two circles that fit equally well, and CR jumps between them.
+        change = 2 * np.diff(radius)
+        own = int(np.count_nonzero((branches == branches[here])[:here]))
+        tilt = float(self._motor.tilt(m_counts))
         return CrSolution(
-            motor_counts=int(m_counts), tilt=float(self._motor.tilt(m_counts)),
-            convergence_radius=2 * float(radius[0]),
-            light_height=float(self._axes(m)[0][0, :, 2].mean()) - self.plane_z,
-            residual=float(residual[0]), center=(float(center[0, 0]), float(center[0, 1])),
-            branch=branch, dcr_dm=self._sensitivity(m[0], branch), reachable=(np.nan, np.nan))
-
-    def _sensitivity(self, m: float, branch: Branch) -> float:
-        """Change of CR to the next count on the branch, m per count.
-
-        Of the two neighbours the one with the smaller change: four points of a very asymmetric
-        head may have two circles that fit equally well, and CR jumps where the better one changes.
-        """
-        low, high = self._motor.limits_counts
-        at = np.clip(m + np.array([-1.0, 0.0, 1.0]), low, high)
-        cr, branches = self.evaluate(at)
-        changes = np.diff(cr)[(np.diff(at) > 0) & (branches[:-1] == branches[1:])]
-        return float(changes[np.argmin(np.abs(changes))]) if len(changes) else 0.0
+            motor_counts=int(m_counts), tilt=tilt, convergence_radius=2 * float(radius[own]),
+            light_height=float(self._motor.ring.axes(tilt)[0][:, 2].mean()) - self.plane_z,
+            residual=float(residual[own]), center=(float(center[own, 0]), float(center[own, 1])),
+            branch=Branch(int(branches[here])), reachable=(np.nan, np.nan),
+            dcr_dm=float(change[np.argmin(np.abs(change))]) if len(change) else 0.0)
 
     # ------------------------------------------------------------------ inverse
 
@@ -173,16 +178,46 @@ class CrSolver:
         """Motor positions (ascending whole counts), CR and branch there, branch ends included."""
         low, high = self._motor.limits_counts
         m = np.unique(np.linspace(low, high, _SAMPLES).round())
-        branch = self._branches(self.intersections(m)[1])
-        below, above = m[:-1][branch[:-1] != branch[1:]], m[1:][branch[:-1] != branch[1:]]
-        side = branch[:-1][branch[:-1] != branch[1:]]
-        while len(below) and np.any(above - below > 1):      # bisect every change of branch
-            middle = np.floor((below + above) / 2)
-            same = self._branches(self.intersections(middle)[1]) == side
-            below, above = np.where(same, middle, below), np.where(same, above, middle)
-        m = np.union1d(m, np.concatenate([below, above]))
-        cr, branch = self.evaluate(m)
-        return m, cr, branch
+        samples = [(m, *self.intersections(m))]
+        branch = self._branches(samples[0][2])
+        changes = branch[:-1] != branch[1:]
+        below, above, side = m[:-1][changes], m[1:][changes], branch[:-1][changes]
+        while len(below) and np.any(above - below > 1):      # narrow down every change of branch
+            tries = np.linspace(below, above, _TRIES, axis=1).round()
+            samples.append((tries.ravel(), *self.intersections(tries.ravel())))
+            there = self._branches(samples[-1][2]).reshape(tries.shape)
+            last = np.argmax(there != side[:, None], axis=1) - 1
+            rows = np.arange(len(below))
+            below, above = tries[rows, last], tries[rows, last + 1]
+        m, points, radial = (np.concatenate(parts) for parts in zip(*samples, strict=True))
+        m, first = np.unique(m, return_index=True)
+        return self._with_jumps(m, *self._circles(points[first], radial[first]))
+
+    def _with_jumps(self, m: NDArray, cr: NDArray, branch: NDArray, poorness: NDArray,
+                    ) -> tuple[NDArray, NDArray, NDArray]:
+        """Samples, with more of them where CR jumps within a branch.
+
+        Four points far from any circle may have two that fit about equally well; where the better
+        one changes CR jumps. The samples close in on such places down to neighbouring counts.
+        """
+        while True:
+            poor = poorness > _POOR
+            if not poor.any():
+                return m, cr, branch
+            slope = np.diff(cr) / np.diff(m)
+            slope[branch[:-1] != branch[1:]] = np.nan
+            lower = np.fmin(slope[:-2], slope[2:])
+            upper = np.fmax(slope[:-2], slope[2:])
+            margin = 0.5 * (upper - lower) + 0.1 * np.maximum(abs(lower), abs(upper))
+            jumps = (slope[1:-1] > upper + margin) | (slope[1:-1] < lower - margin)
+            jumps &= (np.diff(m)[1:-1] > 1) & (poor[1:-2] | poor[2:-1])
+            if not jumps.any():
+                return m, cr, branch
+            between = np.linspace(m[1:-2][jumps], m[2:-1][jumps], 10).round().ravel()
+            added = self._circles(*self.intersections(between))
+            m, first = np.unique(np.concatenate([m, between]), return_index=True)
+            cr, branch, poorness = (np.concatenate([old, new])[first] for old, new in zip(
+                (cr, branch, poorness), added, strict=True))
 
     def reachable(self, branch: Branch) -> tuple[float, float]:
         """Smallest and largest CR on a branch, m; NaN if the branch does not exist.
@@ -193,44 +228,46 @@ class CrSolver:
             exists = [b for b in (Branch.UNCROSSED, Branch.CROSSED, Branch.MIXED)
                       if (self.sampled[2] == b).any()]
             return self.reachable(exists[0]) if exists else (float('nan'), float('nan'))
-        if branch not in self._intervals:
-            ends = (float('nan'), float('nan'))
-            if (self.sampled[2] == branch).any():
-                best = np.array([self._refine(branch, lambda cr: cr),
-                                 self._refine(branch, lambda cr: -cr)])
-                lowest, highest = self.evaluate(best)[0]
-                ends = (float(lowest), float(highest))
-            self._intervals[branch] = ends
-        return self._intervals[branch]
+        if not (self.sampled[2] == branch).any():
+            return float('nan'), float('nan')
+        lowest, highest = self._nearest(branch, [0.0, np.inf])[1]      # CR is never negative
+        return lowest, highest
 
-    def _refine(self, branch: Branch, cost: Callable[[NDArray], NDArray]) -> float:
-        """Whole motor counts of the branch with the smallest cost(CR).
+    def _nearest(self, branch: Branch, goals: list[float]) -> tuple[list[int], list[float]]:
+        """Motor counts of a branch that exists, and CR there, nearest to each wanted CR.
 
-        The cost may have several minima. Each lies beside a sample that is a local minimum, so the
-        neighbourhoods of the best few are searched on ever finer grids down to single counts.
+        The distance may have several minima. Each lies beside a sample that is a local minimum, so
+        the neighbourhoods of the best few are searched on ever finer grids down to single counts,
+        those of all goals together.
         """
-        def costs(cr: NDArray, branches: NDArray) -> NDArray:
-            return np.where(branches == branch, cost(np.nan_to_num(cr)), np.inf)
+        # nearest to infinity: the same order as nearest to more than any CR there is
+        wanted = np.minimum(goals, np.nanmax(self.sampled[1]) * 2 + 1)
+
+        def distance(cr: NDArray, branches: NDArray, goal: NDArray) -> NDArray:
+            return np.where(branches == branch, np.abs(cr - goal), np.inf)
 
         m, cr, branches = self.sampled
-        values = costs(cr, branches)
-        padded = np.concatenate([[np.inf], values, [np.inf]])
-        minima = np.flatnonzero((values <= padded[:-2]) & (values <= padded[2:])
-                                & np.isfinite(values))
-        minima = minima[np.argsort(values[minima], kind='stable')][:3]
-        best, best_value = float(m[minima[0]]), float(values[minima[0]])
-        for index in minima:
-            low, high = m[max(int(index) - 1, 0)], m[min(int(index) + 1, len(m) - 1)]
-            while True:
-                tries = np.unique(np.linspace(low, high, 33).round())
-                there = costs(*self.evaluate(tries))
-                at = int(np.argmin(there))
-                if there[at] < best_value:
-                    best, best_value = float(tries[at]), float(there[at])
-                if high - low <= 32:
-                    break
-                low, high = tries[max(at - 1, 0)], tries[min(at + 1, len(tries) - 1)]
-        return best
+        values = distance(cr, branches, wanted[:, None])
+        is_minimum = np.isfinite(values)
+        is_minimum[:, 1:] &= values[:, 1:] <= values[:, :-1]
+        is_minimum[:, :-1] &= values[:, :-1] <= values[:, 1:]
+        order = np.argsort(np.where(is_minimum, values, np.inf), axis=1, kind='stable')[:, :3]
+        owner, place = np.nonzero(np.take_along_axis(is_minimum, order, axis=1))
+        index = order[owner, place]
+        low, high = m[np.maximum(index - 1, 0)], m[np.minimum(index + 1, len(m) - 1)]
+        rows = np.arange(len(index))
+        while True:
+            tries = np.linspace(low, high, _TRIES, axis=1).round()
+            cr, branches = (found.reshape(tries.shape) for found in self.evaluate(tries.ravel()))
+            there = distance(cr, branches, wanted[owner, None])
+            at = np.argmin(there, axis=1)
+            if np.all(high - low < _TRIES):
+                break
+            low = tries[rows, np.maximum(at - 1, 0)]
+            high = tries[rows, np.minimum(at + 1, _TRIES - 1)]
+        best = [rows[owner == i][np.argmin(there[rows, at][owner == i])]
+                for i in range(len(goals))]
+        return [int(tries[i, at[i]]) for i in best], [float(cr[i, at[i]]) for i in best]
 
     def inverse(self, convergence_radius: float, branch: Branch = Branch.ANY) -> CrSolution:
         """See :func:`inverse`."""
@@ -244,60 +281,15 @@ class CrSolver:
         for candidate in tried:
             if not (self.sampled[2] == candidate).any():
                 continue
-            lowest, highest = self.reachable(candidate)
+            counts, (lowest, highest, _) = self._nearest(candidate, [0.0, np.inf, wanted])
             intervals[candidate] = (lowest, highest)
-            best = self._refine(candidate, lambda cr: np.abs(cr - wanted))
-            solution = self._at(int(best))
+            solution = self._at(counts[-1])
             # farther off than one count moves it lies beyond an end or in a gap of the branch
             if abs(solution.convergence_radius - wanted) <= abs(solution.dcr_dm) + 1e-9:
-                return CrSolution(**{**vars(solution), 'reachable': (lowest, highest)})
+                return replace(solution, reachable=(lowest, highest))
         where = '; '.join(f'{name.name.lower()} {lowest * 1e3:.2f} to {highest * 1e3:.2f} mm'
                           for name, (lowest, highest) in intervals.items())
         raise PsError(ErrorCode.CR_UNREACHABLE,
                       f'CR {wanted * 1e3:.2f} mm cannot be reached'
                       + (f' on the {branch.name.lower()} branch' if branch != Branch.ANY else '')
                       + f'; reachable: {where or "nothing on that branch"}')
-
-
-def fit_circles(points: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Least-squares circles: algebraic start, then Gauss-Newton on the geometric distance.
-
-    :param points: (n, k, 2), k >= 3.
-    :returns: centres (n, 2), radii (n,), rms distances (n,).
-    """
-    mean = points.mean(axis=1, keepdims=True)
-    local = points - mean
-    scale = np.sqrt((local**2).sum(axis=2).mean(axis=1))[:, None, None]
-    scale = np.where(scale > 0, scale, 1.0)
-    local = local / scale                      # well conditioned for any size of circle
-    x, y = local[..., 0], local[..., 1]
-
-    # algebraic (Kasa): x^2 + y^2 = 2 a x + 2 b y + c
-    a, b, c = _solve(2 * x, 2 * y, x**2 + y**2)
-    radius = np.sqrt(np.maximum(c + a**2 + b**2, 0))
-    for _ in range(60):
-        dx, dy = x - a[:, None], y - b[:, None]
-        distance = np.hypot(dx, dy)
-        safe = np.where(distance > 0, distance, 1.0)
-        step_a, step_b, step_radius = _solve(dx / safe, dy / safe, distance - radius[:, None])
-        a, b, radius = a + step_a, b + step_b, radius + step_radius
-        if max(np.abs(step_a).max(), np.abs(step_b).max(), np.abs(step_radius).max()) < 1e-11:
-            break
-    distance = np.hypot(x - a[:, None], y - b[:, None])
-    residual = np.sqrt(((distance - radius[:, None])**2).mean(axis=1))
-    size = scale[:, 0, 0]
-    return mean[:, 0] + size[:, None] * np.stack([a, b], axis=1), radius * size, residual * size
-
-
-def _solve(u: NDArray, v: NDArray, target: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Least squares of many systems a u + b v + c = target; (n, k) each to (n,) each."""
-    mean_u, mean_v, mean_t = u.mean(axis=1), v.mean(axis=1), target.mean(axis=1)
-    du, dv, dt = u - mean_u[:, None], v - mean_v[:, None], target - mean_t[:, None]
-    uu, uv, vv = (du * du).sum(axis=1), (du * dv).sum(axis=1), (dv * dv).sum(axis=1)
-    ut, vt = (du * dt).sum(axis=1), (dv * dt).sum(axis=1)
-    # points on a line have no circle: a tiny ridge keeps the system solvable, the residual tells
-    uu, vv = uu + 1e-13, vv + 1e-13
-    determinant = uu * vv - uv * uv
-    a = (vv * ut - uv * vt) / determinant
-    b = (uu * vt - uv * ut) / determinant
-    return a, b, mean_t - a * mean_u - b * mean_v

@@ -108,12 +108,12 @@ class BrightFieldKinematics:
                           f'{head.name}: bright_field: crank, rod and slider cannot be assembled '
                           'at m0_counts') from error
         tilts = [_wrap(angle - self._offset) for angle in candidates]
-        # slider above the pin, and of two such the one nearer to facing down
+        # of the two the one nearer to facing down
         low, high = field.tilt_range
         middle = 0.0 if low <= 0.0 <= high else (low + high) / 2
-        self._branch = (-1, 1)[int(np.argmin([abs(tilt - middle) for tilt in tilts]))]
-        self._turns = self._crank_angle(self._height(field.slider.m0_counts), self._branch)
-        self._turns -= _wrap(self._turns - self._offset) + self._offset
+        chosen = int(np.argmin([abs(tilt - middle) for tilt in tilts]))
+        self._branch, self._tilt_at_m0 = (-1, 1)[chosen], float(tilts[chosen])
+        self._angle_at_m0 = float(candidates[chosen])
         self.limits_counts = self._usable_interval()
 
     def _height(self, m_counts: ArrayLike) -> Any:
@@ -131,23 +131,28 @@ class BrightFieldKinematics:
         return branch * np.arccos(cosine) - np.arctan2(dz, self._dx)
 
     def _usable_interval(self) -> tuple[int, int]:
-        """Soft limits, cut off at the tilt range and before the next dead points."""
-        low, high = self._slider.limits_counts
-        counts = np.unique(np.linspace(low, high, 4097).round()).astype(np.int64)
-        dz = self._height(counts) - self._hinge[1]
-        distance = np.hypot(self._dx, dz)
-        cosine = (self._radius**2 + distance**2 - self._rod**2) / (2 * self._radius * distance)
-        away = np.arccos(np.clip(cosine, -1, 1))
-        usable = (np.abs(cosine) <= 1) & (away > DEAD_POINT_MARGIN) & (
-            away < math.pi - DEAD_POINT_MARGIN)
-        start = int(np.argmin(np.abs(counts - self._slider.m0_counts)))
-        if not usable[start]:
-            raise PsError(ErrorCode.HEAD_BAD_REQUEST,
-                          'bright_field: m0_counts is at a dead point of the crank')
-        blocked = np.flatnonzero(~usable)
-        first = blocked[blocked < start].max(initial=-1) + 1
-        last = blocked[blocked > start].min(initial=len(counts)) - 1
-        return int(counts[first]), int(counts[last])
+        """Soft limits, cut off before the next dead points on either side of ``m0_counts``."""
+        # rod and crank are in line where slider and hinge are |rod - crank| or rod + crank apart
+        across = self._radius * math.sin(DEAD_POINT_MARGIN)
+        if self._rod > across:
+            reach = math.sqrt(self._rod**2 - across**2)
+            along = self._radius * math.cos(DEAD_POINT_MARGIN)
+            nearest, farthest = abs(reach - along), reach + along
+            start = self._slider.z_at_m0 - self._hinge[1]
+            if nearest < math.hypot(self._dx, start) < farthest:
+                end = math.sqrt(farthest**2 - self._dx**2)
+                hole = math.sqrt(max(nearest**2 - self._dx**2, 0.0))
+                # without a hole around the hinge the slider may pass it
+                dz = (-end, end) if nearest <= abs(self._dx) else (
+                    (hole, end) if start > 0 else (-end, -hole))
+                m = sorted(self._slider.m0_counts + (z - start) / self._dz_dm for z in dz)
+                low, high = self._slider.limits_counts
+                low, high = max(low, math.ceil(m[0])), min(high, math.floor(m[1]))
+                if low < high:
+                    return low, high
+        raise PsError(ErrorCode.HEAD_BAD_REQUEST,
+                      'bright_field: m0_counts is at a dead point of the crank, or all of '
+                      'limits_counts is beyond one')
 
     def check_counts(self, m_counts: ArrayLike) -> None:
         """Refuse motor counts outside the usable interval.
@@ -156,8 +161,8 @@ class BrightFieldKinematics:
         """
         m = np.asarray(m_counts)
         low, high = self.limits_counts
-        if np.any(m < low) or np.any(m > high):
-            wrong = m[(m < low) | (m > high)].ravel()[0]
+        if m.size and not (m.min() >= low and m.max() <= high):
+            wrong = m[~((m >= low) & (m <= high))].ravel()[0]
             raise PsError(ErrorCode.CR_OUT_OF_LIMITS,
                           f'motor counts {wrong:g} are outside {low} to {high}')
 
@@ -169,7 +174,7 @@ class BrightFieldKinematics:
         """
         self.check_counts(m_counts)
         angle = self._crank_angle(self._height(m_counts), self._branch)
-        return angle - self._offset - self._turns
+        return self._tilt_at_m0 + _wrap(angle - self._angle_at_m0)
 
     def dtilt_dm(self, m_counts: ArrayLike) -> Any:
         """Exact derivative of the tilt, rad per count."""

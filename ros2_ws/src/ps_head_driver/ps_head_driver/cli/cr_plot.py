@@ -70,10 +70,11 @@ def _draw_side_view(ax: Axes, head: HeadModel, solver: CrSolver, solution: CrSol
     ax.annotate('', (-radius, plane - 12), (radius, plane - 12),
                 arrowprops={'arrowstyle': '<->', 'color': _AXIS})
     ax.text(0, plane - 17, f'CR {2 * radius:.1f} mm', color=_AXIS, ha='center', va='top')
-    ax.set(title=f'{head.name}: m = {solution.motor_counts}, tilt '
+    ax.set_title(f'{head.name}\nm = {solution.motor_counts}, tilt '
                  f'{np.degrees(solution.tilt):.1f}°, h = {solution.light_height * mm:.1f} mm',
-           xlabel='x, mm', ylabel='z, mm', aspect='equal', ylim=(plane - 40, standoff + 20))
-    ax.legend(loc='upper left', fontsize=8, frameon=False)
+                 fontsize=11)
+    ax.set(xlabel='x, mm', ylabel='z, mm', aspect='equal', ylim=(plane - 40, standoff + 20))
+    ax.legend(loc='upper center', bbox_to_anchor=(0.5, -0.12), ncols=4, fontsize=8, frameon=False)
     _tidy(ax)
 
 
@@ -82,11 +83,14 @@ def _draw_curve(ax: Axes, solver: CrSolver, solution: CrSolution) -> None:
     ceiling = max(3 * solution.convergence_radius, 0.25) * 1e3
     for which, colour in _BRANCH_COLOURS.items():
         if (branch == which).any():
-            ax.plot(m, np.where(branch == which, cr, np.nan) * 1e3, color=colour, lw=2,
+            # where the branches mix the fit may run off towards a straight line
+            shown = (branch == which) & ((which != Branch.MIXED) | (cr * 1e3 < ceiling))
+            ax.plot(m, np.where(shown, cr, np.nan) * 1e3, color=colour, lw=2,
                     label=which.name.lower())
     ax.plot([solution.motor_counts], [solution.convergence_radius * 1e3], 'o', color=_INK, ms=7)
     ax.axhline(solution.convergence_radius * 1e3, color=_INK, lw=0.8, ls=':')
-    ax.set(title='CR over the range of the motor', xlabel='motor, counts', ylabel='CR, mm',
+    ax.set_title('CR over the range of the motor', fontsize=11)
+    ax.set(xlabel='motor, counts', ylabel='CR, mm',
            ylim=(0, ceiling))
     ax.legend(frameon=False)
     _tidy(ax)

@@ -41,35 +41,47 @@ def as_json(solution: CrSolution) -> dict:
         'center_offset_m': list(solution.center)}
 
 
-def main() -> None:
-    """Run the command line."""
-    arguments = _parser().parse_args()
-    try:
-        head = load_head(arguments.head or nominal_head_path())
-        solver = CrSolver(head, arguments.light_height)
-        if arguments.cr is not None:
-            solution = solver.inverse(arguments.cr, Branch[arguments.branch.upper()])
-        else:
-            solution = solver.forward(arguments.motor_counts)
-        if arguments.json:
-            arguments.json.write_text(json.dumps(as_json(solution), indent=2) + '\n')
-        if arguments.plot:
-            from ps_head_driver.cli.cr_plot import plot
-            plot(head, solver, solution, arguments.plot)
-    except PsError as error:
-        sys.exit(f'ps_cr: {error.code.name}: {error.message}')
-    except OSError as error:
-        sys.exit(f'ps_cr: {error.filename}: {error.strerror}')
+def _length(metres: float) -> str:
+    return f'{metres * 1e3:.2f} mm' if abs(metres) < 10 else f'{metres:.0f} m'
+
+
+def _print(solution: CrSolution) -> None:
     low, high = solution.reachable
+    x, y = solution.center
     print(f'motor counts   {solution.motor_counts}\n'
           f'tilt           {math.degrees(solution.tilt):.3f} deg\n'
-          f'CR             {solution.convergence_radius * 1e3:.3f} mm '
-          f'({solution.branch.name.lower()}, reachable {low * 1e3:.2f} to {high * 1e3:.2f} mm)\n'
-          f'light height   {solution.light_height * 1e3:.3f} mm\n'
+          f'CR             {_length(solution.convergence_radius)} '
+          f'({solution.branch.name.lower()}, reachable {_length(low)} to {_length(high)})\n'
+          f'light height   {_length(solution.light_height)}\n'
           f'sensitivity    {solution.dcr_dm * 1e6:.3f} um per count\n'
-          f'circle fit     residual {solution.residual * 1e6:.3f} um, centre '
-          f'({solution.center[0] * 1e3:.3f}, {solution.center[1] * 1e3:.3f}) mm')
+          f'circle fit     residual {_length(solution.residual)}, centre '
+          f'({_length(x)}, {_length(y)})')
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; returns the exit code."""
+    given = _parser().parse_args(arguments)
+    try:
+        head = load_head(given.head or nominal_head_path())
+        solver = CrSolver(head, given.light_height)
+        if given.cr is not None:
+            solution = solver.inverse(given.cr, Branch[given.branch.upper()])
+        else:
+            solution = solver.forward(given.motor_counts)
+        if given.json:
+            given.json.write_text(json.dumps(as_json(solution), indent=2) + '\n')
+        if given.plot:
+            from ps_head_driver.cli.cr_plot import plot  # slow to import
+            plot(head, solver, solution, given.plot)
+    except PsError as error:
+        print(f'ps_cr: {error.code.name}: {error.message}', file=sys.stderr)
+        return 1
+    except OSError as error:
+        print(f'ps_cr: {error.filename}: {error.strerror}', file=sys.stderr)
+        return 1
+    _print(solution)
+    return 0
 
 
 if __name__ == '__main__':
-    main()
+    sys.exit(main())

@@ -33,9 +33,10 @@ class ConvergenceRadius(Node):
         ros_support.Diagnostics(self, {'Solver': self._diagnose})
 
     def _use(self, head: HeadModel) -> None:
+        solver = CrSolver(head)
+        _ = solver.sampled      # the slow part, and the compiler's, before the first request
         self.head = head
-        # the samples a solver takes are kept for the next request at the same light height
-        self._solvers: dict[float, CrSolver] = {}
+        self._solvers = {0.0: solver}
 
     def _on_calibration(self, message: ps.HeadCalibration) -> None:
         try:
@@ -46,8 +47,9 @@ class ConvergenceRadius(Node):
 
     def _solver(self, light_height: float) -> CrSolver:
         if light_height not in self._solvers:
-            solver = CrSolver(self.head, light_height or None)
-            self._solvers = {light_height: solver}
+            # the head's own height and the last one asked for: a client asks for the same again
+            self._solvers = {0.0: self._solvers[0.0],
+                             light_height: CrSolver(self.head, light_height)}
         return self._solvers[light_height]
 
     @answers(ErrorCode.CR_INTERNAL)

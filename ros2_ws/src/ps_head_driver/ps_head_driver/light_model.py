@@ -26,14 +26,13 @@ def light_vectors(light: Light, points: ArrayLike) -> NDArray:
     :param light: near or distant; its intensity is included (the mean, if given per channel).
     :param points: (..., 3), ps_head_plane, m.
     :returns: (..., 3) float64; zero for points behind the panel. A distant light has unit
-        irradiance
-        times intensity; a near one the solid-angle measure of Lambert's formula (radiance 1).
+        irradiance times intensity; a near one that of a panel of radiance 1, times intensity.
     """
     points = np.asarray(points, np.float64)
     intensity = float(np.mean(light.intensity))
     if light.distant:
-        return np.broadcast_to(-intensity * np.asarray(light.axis, np.float64),
-        points.shape).copy()
+        towards = -intensity * np.asarray(light.axis, np.float64)
+        return np.broadcast_to(towards, points.shape).copy()
     if light.size[0] <= 0 or light.size[1] <= 0:
         return intensity * _point_source(light, points, np.asarray(light.position, np.float64))
     if light.lobe_exponent == 1.0:

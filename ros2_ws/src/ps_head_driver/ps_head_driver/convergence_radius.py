@@ -19,7 +19,7 @@ from ps_head_driver.kinematics import BrightFieldKinematics
 # motor positions at which the inverse looks first; it refines between them
 _SAMPLES = 129
 # positions tried inside each of the intervals that the samples leave, until single counts
-_TRIES = 65
+_TRIES = 17
 # a fit with a larger residual (over the radius) may have a rival that fits as well
 _POOR = 0.05
 # an axis flatter than this does not meet the plane anywhere near the head

@@ -69,6 +69,10 @@ def test_forward_agrees_with_rays_and_an_independent_circle_fit(seed, where, lig
     solution = solver.forward(m)
     if solution.residual > 0.1 * solution.convergence_radius:
         return       # no circle to speak of: the fit may have two answers
+    if size < 0.1 * solution.convergence_radius:
+        # points almost in line: the best circle is a huge one, which the reference may not find
+        assert solution.residual <= size * np.sqrt(np.mean(best.fun**2)) + 1e-9
+        return
     tolerance = 1e-9 + 1e-8 * size      # the reference optimiser's own precision
     assert solution.convergence_radius == pytest.approx(2 * size * best.x[2], abs=tolerance)
     assert solution.residual == pytest.approx(size * np.sqrt(np.mean(best.fun**2)), abs=1e-9)

@@ -353,7 +353,7 @@ def build_workspace(ros: Path | None, base: str, fresh: bool) -> None:
     done, wanted = read_stamps(path), workspace_stamps(base)
     if done == wanted:
         return
-    if fresh and done:  # built against another environment
+    if fresh or not done:  # built against another environment, unfinished or by hand
         for name in ('build', 'install'):
             shutil.rmtree(WORKSPACE / name, ignore_errors=True)
         done = {}

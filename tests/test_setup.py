@@ -185,6 +185,25 @@ def test_stamps_follow_descriptions_not_code(tmp_path: Path,
     assert project_setup.workspace_stamps('base')['interfaces'] != before['interfaces']
 
 
+@pytest.mark.parametrize(('finished', 'fresh', 'kept'),
+                         [(True, False, True), (True, True, False), (False, False, False)])
+def test_builds_of_others_are_not_built_upon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                             finished: bool, fresh: bool, kept: bool) -> None:
+    (tmp_path / 'src').mkdir()
+    for name in ('build', 'install'):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / 'of_a_plain_colcon_build').touch()
+    if finished:
+        (tmp_path / 'install' / 'setup.json').write_text('{"interfaces": "old"}')
+    monkeypatch.setattr(project_setup, 'WORKSPACE', tmp_path)
+    monkeypatch.setattr(project_setup, 'build_environment', lambda ros: {})
+    monkeypatch.setattr(project_setup, 'logged',
+                        lambda *args, **named: (tmp_path / 'install').mkdir(exist_ok=True))
+    project_setup.build_workspace(None, 'base', fresh)
+    assert (tmp_path / 'build' / 'of_a_plain_colcon_build').exists() == kept
+    assert project_setup.read_stamps(tmp_path / 'install' / 'setup.json')['interfaces'] != 'old'
+
+
 def test_wheels_are_repaired_through_new_files(tmp_path: Path,
                                                monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(project_setup, 'VENV', tmp_path)

@@ -5,8 +5,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from ps_head_driver.fake.renderer import MATT, Sensor, emitters, make_renderer
+from ps_head_driver.fake.renderer import Sensor, emitters, make_renderer
 from ps_head_driver.fake.scenes import SCENES
+from ps_head_driver.fake.surface_renderer import MATT
 from ps_head_driver.head_model import DIRECTIONS, load_head, nominal_head_path
 from ps_head_driver.kinematics import BrightFieldKinematics, DarkFieldKinematics
 from ps_head_driver.stack import angular_error_deg

@@ -7,15 +7,9 @@ import pytest
 from scipy.integrate import dblquad
 
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_head_driver.fake.renderer import (
-    MATT,
-    Renderer,
-    Sensor,
-    corners,
-    emitters,
-    make_renderer,
-)
-from ps_head_driver.fake.scenes import Scene, make_scene
+from ps_head_driver.fake.renderer import Sensor, corners, emitters, make_renderer
+from ps_head_driver.fake.scenes import SCENES, Scene, make_scene
+from ps_head_driver.fake.surface_renderer import MATT, SurfaceRenderer
 from ps_head_driver.frames import slope_to_normal
 from ps_head_driver.head_model import DIRECTIONS, load_head, nominal_head_path
 from ps_head_driver.kinematics import BrightFieldKinematics, DarkFieldKinematics
@@ -38,7 +32,7 @@ def grid_scene(height, albedo=0.8, pitch=5e-5, **gloss):
 
 def seen_points(renderer):
     """Where the pixels look: x, y, z, each (H, W)."""
-    return renderer._points[:3].reshape(3, *renderer._shape).astype(float)
+    return renderer._points[:3].reshape(3, *renderer.shape).astype(float)
 
 
 def irradiance(pose, point):
@@ -120,12 +114,12 @@ def test_tilted_plate_faces_the_lower_side():
 
 def test_cast_shadow_of_a_step_has_the_penumbra_of_the_panel():
     pitch, step, drop = 5e-5, -0.002, 0.004
-    renderer = Renderer(grid_scene(lambda x, y: np.where(x >= step - 1e-9, 0.0, -drop)), HEAD,
-                        CLEAN, scale=0.5)
+    renderer = SurfaceRenderer(
+        grid_scene(lambda x, y: np.where(x >= step - 1e-9, 0.0, -drop)), HEAD, CLEAN, scale=0.5)
     edge = step + pitch     # where the spline has reached the upper level
-    flat = Renderer(grid_scene(lambda x, y: np.full_like(x, -drop)), HEAD, CLEAN, scale=0.5)
+    flat = SurfaceRenderer(grid_scene(lambda x, y: np.full_like(x, -drop)), HEAD, CLEAN, scale=0.5)
     pose = BRIGHT.panel_pose('E', TILT)
-    row = renderer._shape[0] // 2
+    row = renderer.shape[0] // 2
     x, y, z = (values[row] for values in seen_points(renderer))
     low = (z < -drop + 1e-6) & (x < edge - 1e-4)
     measured = (renderer.panel_radiance(pose)[row] / flat.panel_radiance(pose)[row])[low]
@@ -145,9 +139,8 @@ def test_cast_shadow_of_a_step_has_the_penumbra_of_the_panel():
 
 
 def test_no_shadow_on_the_lit_side_of_a_step():
-    renderer = Renderer(grid_scene(lambda x, y: np.where(x >= 0, 0.0, -0.004)), HEAD, CLEAN,
-                        scale=0.1)
-    flat = Renderer(grid_scene(lambda x, y: np.full_like(x, -0.004)), HEAD, CLEAN, scale=0.1)
+    renderer, flat = (SurfaceRenderer(grid_scene(height), HEAD, CLEAN, scale=0.1) for height in (
+        lambda x, y: np.where(x >= 0, 0.0, -0.004), lambda x, y: np.full_like(x, -0.004)))
     pose = BRIGHT.panel_pose('W', TILT)
     x, _, z = seen_points(renderer)
     low = (z < -0.004 + 1e-6) & (x < -5e-4)
@@ -189,8 +182,39 @@ def test_dome_truth_is_the_sphere():
     assert np.abs(truth.height[np.hypot(x, y) > radius + 2e-4]).max() < 1e-9
 
 
-def test_disc_normals_are_the_slopes_of_its_height():
-    scene = make_scene('disc')
+def test_boss_is_as_high_and_as_steep_as_asked():
+    scene = make_scene('boss', height='0.001')      # as text, like from a parameter
+    x = np.linspace(0, 0.006, 3001)
+    z, p, _ = scene.surface(x, np.zeros_like(x))
+    assert z[0] == pytest.approx(0.001, rel=5e-4)
+    assert abs(z[-1]) < 1e-9
+    assert math.degrees(math.atan(-p.min())) == pytest.approx(20, abs=0.02)
+
+
+@pytest.mark.parametrize(('ra', 'correlation'), [(0.8e-6, 2e-4), (12.5e-6, 4e-4)])
+def test_specimen_has_the_roughness_and_correlation_asked_for(ra, correlation):
+    scene = make_scene('roughness', ra=ra, correlation=correlation)
+    step = 2.5e-5
+    x, y = np.meshgrid(np.arange(-800, 800) * step, np.arange(-600, 600, 8) * step)
+    z = scene.surface(x, y)[0]
+    assert np.abs(z - z.mean()).mean() == pytest.approx(ra, rel=0.03)
+    lag = round(correlation / step)
+    z -= z.mean()
+    assert (z[:, :-lag] * z[:, lag:]).mean() / (z ** 2).mean() == pytest.approx(
+        math.exp(-1), abs=0.05)
+
+
+def test_scratches_have_three_depths_in_four_directions():
+    scene = make_scene('scratches', depth=1e-5)
+    columns = (np.arange(4) - 1.5) * 0.011
+    for row, depth in ((0.012, 5e-6), (0.0, 1e-5), (-0.012, 2e-5)):
+        bottom = scene.surface(columns, np.full(4, row))[0]
+        np.testing.assert_allclose(bottom, -depth, rtol=0.15)     # the spline rounds it
+
+
+@pytest.mark.parametrize('name', [name for name in SCENES if name != 'ring'])
+def test_normals_of_every_scene_are_the_slopes_of_its_height(name):
+    scene = make_scene(name)
     random = np.random.default_rng(3)
     x, y = random.uniform(-0.02, 0.02, (2, 20_000))
     _, p, q = scene.surface(x, y)
@@ -198,7 +222,7 @@ def test_disc_normals_are_the_slopes_of_its_height():
     for slope, dx, dy in ((p, h, 0.0), (q, 0.0, h)):
         above, below = scene.surface(x + dx, y + dy)[0], scene.surface(x - dx, y - dy)[0]
         difference = (above - below) / (2 * h)
-        np.testing.assert_allclose(slope, difference, atol=1e-4 * np.abs(slope).max())
+        np.testing.assert_allclose(slope, difference, atol=1e-4 * max(np.abs(slope).max(), 1e-6))
 
 
 def test_pixels_look_along_the_rays_of_a_distorted_lens():
@@ -211,8 +235,8 @@ def test_pixels_look_along_the_rays_of_a_distorted_lens():
     small = renderer.camera
     matrix = np.array([[small.fx, 0, small.cx], [0, small.fy, small.cy], [0, 0, 1]])
     pixels = cv2.projectPoints(optical, np.zeros(3), np.zeros(3), matrix,
-                               np.array(small.distortion))[0].reshape(*renderer._shape, 2)
-    v, u = np.mgrid[:renderer._shape[0], :renderer._shape[1]]
+                               np.array(small.distortion))[0].reshape(*renderer.shape, 2)
+    v, u = np.mgrid[:renderer.shape[0], :renderer.shape[1]]
     assert np.abs(pixels - np.stack([u, v], axis=-1)).max() < 1e-3
     z = renderer.scene.surface(points[:, 0], points[:, 1])[0]
     assert np.abs(z - points[:, 2]).max() < 1e-8
@@ -240,7 +264,8 @@ def test_head_tolerances_show(plate):
     panels = dict(HEAD.bright_field.panels)
     panels['E'] = panels['E'].model_copy(update={'shift': (0.0, 0.02, 0.0), 'intensity': 1.1})
     bright = HEAD.bright_field.model_copy(update={'panels': panels})
-    other = Renderer(plate.scene, HEAD.model_copy(update={'bright_field': bright}), CLEAN, 0.05)
+    other = SurfaceRenderer(plate.scene, HEAD.model_copy(update={'bright_field': bright}), CLEAN,
+                            0.05)
     ratio = other.radiance(TILT, DF_TILT, ON['E']) / plate.radiance(TILT, DF_TILT, ON['E'])
     assert ratio[0].mean() > 1.1 > ratio[-1].mean()       # it moved along +y: up in the picture
     np.testing.assert_array_equal(other.radiance(TILT, DF_TILT, ON['W']),
@@ -251,8 +276,8 @@ def test_gloss_mirrors_the_panel():
     """A plate that bisects the angle between camera and panel shows a highlight, matt or not."""
     centre = BRIGHT.panel_pose('E', TILT).center
     slope = -math.tan(math.atan2(centre[0], centre[2]) / 2)
-    renderers = [Renderer(grid_scene(lambda x, y: slope * x, specular=s, roughness=0.15), HEAD,
-                          CLEAN, scale=0.05) for s in (0.0, 0.05)]
+    renderers = [SurfaceRenderer(grid_scene(lambda x, y: slope * x, specular=s, roughness=0.15),
+                                 HEAD, CLEAN, scale=0.05) for s in (0.0, 0.05)]
     for direction, mirrors in (('E', True), ('W', False), ('N', False)):
         matt, glossy = (r.radiance(TILT, DF_TILT, ON[direction])[25, 32] for r in renderers)
         assert glossy >= matt
@@ -305,10 +330,10 @@ def test_exposure_strobe_gain_and_saturation(plate):
 
 
 def test_ambient_light_and_vignetting(plate):
-    room = Renderer(plate.scene, HEAD, Sensor(16, noise=False, ambient=0.1), 0.05)
+    room = SurfaceRenderer(plate.scene, HEAD, Sensor(16, noise=False, ambient=0.1), 0.05)
     dark = room.render(TILT, DF_TILT, (0, 0, 0, 0), exposure=0.008, strobe=0.001)
     assert dark[25, 32] == pytest.approx(0.8 * 0.1 * 2 * 65535, rel=1e-3)
-    lens = Renderer(plate.scene, HEAD, Sensor(16, noise=False, vignetting=0.3), 0.05)
+    lens = SurfaceRenderer(plate.scene, HEAD, Sensor(16, noise=False, vignetting=0.3), 0.05)
     ratio = lens.render(TILT, DF_TILT, ON['E']) / plate.render(TILT, DF_TILT, ON['E'])
     assert ratio[0, 0] == pytest.approx(0.7, abs=0.01)
     assert ratio[25, 32] == pytest.approx(1.0, abs=0.01)
@@ -317,12 +342,24 @@ def test_ambient_light_and_vignetting(plate):
 # ---------------------------------------------------------------------------- wrong requests
 
 def test_wrong_scenes_are_refused_by_name():
-    with pytest.raises(PsError, match='plate, tilted_plate, dome, disc') as unknown:
+    with pytest.raises(PsError, match=r'plate, glossy_plate, .*copper, ring') as unknown:
         make_scene('moon')
     assert unknown.value.code == ErrorCode.SEQUENCER_BAD_REQUEST
     with pytest.raises(PsError, match=r"'colour'.*radius, height"):
         make_scene('dome', colour=3)
+    with pytest.raises(PsError, match='height=tall is not a float'):
+        make_scene('boss', height='tall')
+    with pytest.raises(PsError, match='grid pitches, 150 um'):
+        make_scene('roughness', correlation=1e-4)
+    with pytest.raises(PsError, match='albedo and specular'):
+        make_scene('plate', albedo=1.5)
+    with pytest.raises(PsError, match=r'roughness of 0\.1 to 1'):
+        make_scene('glossy_plate', roughness=0.01)
+    with pytest.raises(PsError, match="'height' is not of the form name=value"):
+        make_renderer('boss:height', HEAD)
+    with pytest.raises(PsError, match=r"'bent'.*no_wall, turned_over"):
+        make_renderer('ring:defect=bent', HEAD)
     with pytest.raises(PsError, match='smaller than the field of view'):
-        Renderer(make_scene('plate', size=(0.03, 0.03)), HEAD)
+        SurfaceRenderer(make_scene('plate', size=(0.03, 0.03)), HEAD)
     with pytest.raises(ValueError, match='bit_depth'):
         Sensor(bit_depth=12)

@@ -17,7 +17,7 @@ HEAD = load_head(nominal_head_path())
 def test_matt_plate(m_counts):
     df_tilt = 1.3
     renderer = make_renderer('tilted_plate', HEAD, Sensor(noise=False), scale=0.05)
-    points = np.moveaxis(renderer._points[:3].reshape(3, *renderer._shape), 0, -1).astype(float)
+    points = np.moveaxis(renderer._points[:3].reshape(3, *renderer.shape), 0, -1).astype(float)
     normal = renderer.truth().normal
     tilt = float(BrightFieldKinematics(HEAD).tilt(m_counts))
     singles = [light for light in lights_at(HEAD, m_counts, df_tilt) if light.is_equation]

@@ -9,16 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ps_head_driver.fake.features import scratch, smoothstep
+
 _RADIUS = 0.0185
 _RIM = (0.0160, 0.0176)          # raised ring, inner and outer radius
 _RIM_HEIGHT = 2.5e-4
 _THICKNESS = 1.5e-3
 _FEED = 4e-4                     # turning marks: tool advance per revolution
-
-
-def _smoothstep(edge0: float, edge1: float, x: NDArray) -> NDArray:
-    t = np.clip((x - edge0) / (edge1 - edge0), 0.0, 1.0)
-    return t * t * (3.0 - 2.0 * t)
 
 
 def machined_disc(x: NDArray, y: NDArray, text: str = '0427', seed: int = 7,
@@ -32,8 +29,8 @@ def machined_disc(x: NDArray, y: NDArray, text: str = '0427', seed: int = 7,
     random = np.random.default_rng(seed)
     r = np.hypot(x, y)
     z = _turning_marks(r, random)
-    z += _RIM_HEIGHT * (_smoothstep(_RIM[0] - 2e-4, _RIM[0] + 2e-4, r)
-                        - _smoothstep(_RIM[1] - 2e-4, _RIM[1] + 2e-4, r))
+    z += _RIM_HEIGHT * (smoothstep(_RIM[0] - 2e-4, _RIM[0] + 2e-4, r)
+                        - smoothstep(_RIM[1] - 2e-4, _RIM[1] + 2e-4, r))
     # centre bore: countersunk at 30 degrees, flat bottom
     z -= np.clip((3.2e-3 - r) * math.tan(math.radians(30)), 0.0, 8e-4)
     def within(cx: float, cy: float, reach: float) -> tuple[slice, slice]:
@@ -51,7 +48,10 @@ def machined_disc(x: NDArray, y: NDArray, text: str = '0427', seed: int = 7,
     for _ in range(9):
         cx, cy = random.uniform(-0.011, 0.011, 2)
         part = within(cx, cy, 0.006)
-        z[part] += _scratch(x[part] - cx, y[part] - cy, random)
+        along, length = random.uniform(0, math.pi), random.uniform(3e-3, 9e-3)
+        bend, width = random.uniform(-8, 8), random.uniform(7e-5, 1.3e-4)
+        z[part] += scratch(x[part] - cx, y[part] - cy, along, length, width,
+                           random.uniform(6e-6, 2e-5), bend)
     for cx, cy, radius, depth in ((-0.0095, -0.0030, 7e-4, 6e-5), (0.0105, 0.0048, 4e-4, 4e-5)):
         part = within(cx, cy, 4 * radius)
         z[part] += _ding(np.hypot(x[part] - cx, y[part] - cy) / radius, depth)
@@ -83,25 +83,13 @@ def _stamp(x: NDArray, y: NDArray, text: str, depth: float, height: float) -> ND
     cv2.putText(canvas, text, (70, 190), cv2.FONT_HERSHEY_SIMPLEX, 120 / 22, 255, 1, cv2.LINE_8)
     distance = cv2.distanceTransform(255 - canvas, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * pixel
     groove = 0.07 * height
-    profile = depth * (1 - _smoothstep(0.0, groove, distance))
+    profile = depth * (1 - smoothstep(0.0, groove, distance))
     profile -= 0.12 * depth * np.exp(-((distance - 1.35 * groove) / (0.35 * groove)) ** 2)
     profile = cv2.GaussianBlur(profile, (0, 0), 2.0).astype(np.float32)
     column = x / pixel + (canvas.shape[1] - 1) / 2
     row = 130 - y / pixel
     return cv2.remap(profile, column.astype(np.float32), row.astype(np.float32),
                      cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-
-
-def _scratch(x: NDArray, y: NDArray, random: np.random.Generator) -> NDArray:
-    """A straight or slightly bent groove with raised lips that runs out at both ends; m."""
-    along = random.uniform(0, math.pi)
-    length, bend = random.uniform(3e-3, 9e-3), random.uniform(-8, 8)
-    width, depth = random.uniform(7e-5, 1.3e-4), random.uniform(6e-6, 2e-5)
-    u = x * math.cos(along) + y * math.sin(along)
-    v = y * math.cos(along) - x * math.sin(along) - bend * u * u
-    ends = 1 - _smoothstep(0.35 * length, 0.5 * length, np.abs(u))
-    shape = np.exp(-(v / width) ** 2) - 0.35 * np.exp(-((np.abs(v) - 2 * width) / width) ** 2)
-    return -depth * ends * shape
 
 
 def _ding(d: NDArray, depth: float) -> NDArray:
@@ -113,6 +101,6 @@ def _stain(x: NDArray, y: NDArray) -> NDArray:
     """Relative reflectance: a stroke of ink, to be seen in the pictures but not in the shape."""
     u, v = 0.94 * x + 0.34 * y, -0.34 * x + 0.94 * y
     wave = v + 0.0045 - 6e-4 * np.sin(u / 1.1e-3)
-    stroke = (1 - _smoothstep(7e-4, 9e-4, np.abs(wave))) * (
-        1 - _smoothstep(8.5e-3, 9e-3, np.abs(u - 0.003)))
+    stroke = (1 - smoothstep(7e-4, 9e-4, np.abs(wave))) * (
+        1 - smoothstep(8.5e-3, 9e-3, np.abs(u - 0.003)))
     return 1 - 0.55 * stroke

@@ -1,9 +1,13 @@
 """The fake camera's pictures: what a head with its true geometry makes of a scene.
 
-For each pixel the ray through the lens meets the surface; for each panel the radiance of that
-point is summed over emitters on the panel, with attached and cast shadows (shading.py). Radiance
-is linear in the panels' levels and kept, so that a repeated frame costs only scaling and noise.
+For each pixel the ray through the lens meets something; for each panel the radiance of that point
+is summed over emitters on the panel, with attached and cast shadows (surface_renderer.py for
+surfaces, ring_renderer.py for the calibration target). Radiance is linear in the panels' levels
+and kept, so that a repeated frame costs only scaling and noise.
+
+Left out: light that goes from surface to surface, the blur of the lens, colour.
 """
+from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,19 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ps_head_driver.camera_model import pixel_rays, scaled_camera
-from ps_head_driver.fake import shading
-from ps_head_driver.fake.scenes import SIZE, Scene, make_scene
-from ps_head_driver.frames import slope_to_normal
-from ps_head_driver.head_model import DIRECTIONS, CameraGeometry, HeadModel
+from ps_head_driver.camera_model import scaled_camera
+from ps_head_driver.head_model import DIRECTIONS, HeadModel
 from ps_head_driver.kinematics import BrightFieldKinematics, DarkFieldKinematics, PanelPose
 from ps_head_driver.stack import Truth
-
-#: Emitters along a panel's width and height: where all of a matt or a glossy point's panel is
-#: visible, and where part of it is.
-MATT, GLOSSY, PARTIAL = (5, 3), (12, 6), (10, 5)
-
-_DEEPEST, _BORDER = 0.010, 0.004     # m; a scene reaches this far below the plane, and aside
 
 OFF = (0.0, 0.0, 0.0, 0.0)
 
@@ -125,20 +120,9 @@ def corners(pose: PanelPose) -> NDArray:
                      for a in (-1, 1) for b in (-1, 1)])
 
 
-def camera_rays(camera: CameraGeometry) -> tuple[NDArray, NDArray]:
-    """Directions of all pixels in ps_head_plane axes, scaled to z = -1.
+class Renderer(ABC):
+    """Pictures and truth of something under one head.
 
-    :returns: x and y, each (H * W,) float64.
-    """
-    v, u = np.mgrid[:camera.height_px, :camera.width_px]
-    rays = pixel_rays(camera, np.stack([u, v], axis=-1)).reshape(-1, 3)
-    return np.ascontiguousarray(rays[:, 0]), np.ascontiguousarray(rays[:, 1])
-
-
-class Renderer:
-    """Pictures and truth of one scene under one head.
-
-    :param scene: what lies under the head.
     :param head: the head as it really is.
     :param sensor: the camera behind the lens.
     :param scale: picture size relative to the head's camera.
@@ -146,29 +130,38 @@ class Renderer:
     :param cache_bytes: radiance of panels kept for frames to come.
     """
 
-    def __init__(self, scene: Scene, head: HeadModel, sensor: Sensor | None = None,
-                 scale: float = 1.0, seed: int = 1, cache_bytes: int = 400_000_000) -> None:
-        self.scene, self.head, self.sensor = scene, head, sensor or Sensor()
-        self.seed = seed
+    def __init__(self, head: HeadModel, sensor: Sensor | None = None, scale: float = 1.0,
+                 seed: int = 1, cache_bytes: int = 400_000_000) -> None:
+        self.head, self.sensor, self.seed = head, sensor or Sensor(), seed
         self.camera = scaled_camera(head.camera, round(head.camera.width_px * scale),
                                     round(head.camera.height_px * scale))
-        self._shape = (self.camera.height_px, self.camera.width_px)
+        self.shape = (self.camera.height_px, self.camera.width_px)
         self._bright, self._dark = BrightFieldKinematics(head), DarkFieldKinematics(head)
         self._cache: OrderedDict[tuple, NDArray] = OrderedDict()
         self._cache_bytes = cache_bytes
-        rays = camera_rays(self.camera)
-        scene.require_covers(rays, self.camera.camera_standoff)
-        with shading.KERNEL_LOCK:
-            self._points = shading.intersect(
-                scene.height, scene.albedo, *scene.origin, scene.pitch, *scene.height_range,
-                *rays, self.camera.camera_standoff)
-        self._shadow_grids = shading.shadow_grids(scene.height, *scene.origin, scene.pitch)
         self._vignette = self._vignetting()
+
+    @property
+    @abstractmethod
+    def albedo(self) -> NDArray:
+        """Diffuse reflectance of what each pixel sees, (H, W) float32."""
+
+    @abstractmethod
+    def truth(self) -> Truth:
+        """True normals (n_plane) and heights where the pixels really look."""
+
+    @abstractmethod
+    def _trace(self, pose: PanelPose) -> NDArray:
+        """Radiance towards the camera under one panel at full level, (H, W) float32."""
+
+    @abstractmethod
+    def warm_up(self) -> None:
+        """Compile the kernels now, not with the first picture."""
 
     def _vignetting(self) -> NDArray | None:
         if not self.sensor.vignetting:
             return None
-        height, width = self._shape
+        height, width = self.shape
         y, x = np.ogrid[-1:1:height * 1j, -1:1:width * 1j]
         return (1 - self.sensor.vignetting * (x * x + y * y) / 2).astype(np.float32)
 
@@ -182,13 +175,7 @@ class Renderer:
         if key in self._cache:
             self._cache.move_to_end(key)
             return self._cache[key]
-        with shading.KERNEL_LOCK:
-            radiance = shading.shade(
-                self._points, self.scene.specular, self.scene.roughness,
-                *emitters(pose, GLOSSY if self.scene.specular else MATT, gauss=True),
-                *emitters(pose, PARTIAL, gauss=False), corners(pose), pose.intensity,
-                *self._shadow_grids, self.scene.height_range[1], *self.scene.origin,
-                self.scene.pitch, self.camera.camera_standoff).reshape(self._shape)
+        radiance = self._trace(pose)
         radiance.flags.writeable = False
         self._cache[key] = radiance
         while len(self._cache) > 1 and len(self._cache) * radiance.nbytes > self._cache_bytes:
@@ -205,7 +192,7 @@ class Renderer:
         :param df_levels: the same for the dark field.
         :returns: (H, W) float32 in units of a panel's radiance.
         """
-        total = np.zeros(self._shape, np.float32)
+        total = np.zeros(self.shape, np.float32)
         for panel_pose, angle, levels in ((self._bright.panel_pose, tilt, bf_levels),
                                           (self._dark.panel_pose, df_tilt, df_levels)):
             for direction, level in zip(DIRECTIONS, levels, strict=True):
@@ -233,38 +220,24 @@ class Renderer:
         level *= np.float32(_REFERENCE_LEVEL / _REFERENCE_RADIANCE * strobe / sensor.exposure)
         if sensor.ambient:
             level += (np.float32(sensor.ambient * exposure / sensor.exposure)
-                      * self._points[5].reshape(self._shape))
+                      * self.albedo)
         if self._vignette is not None:
             level *= self._vignette
         return sensor.expose(level, gain, np.random.default_rng([self.seed, frame]))
-
-    def warm_up(self) -> None:
-        """Compile the kernels now, not with the first picture."""
-        points, self._points = self._points, self._points[:, :1]
-        shape, self._shape = self._shape, (1, 1)
-        try:
-            self.panel_radiance(self._bright.panel_pose('E', 0.5))
-        finally:
-            self._points, self._shape = points, shape
-            self._cache.clear()
-
-    def truth(self) -> Truth:
-        """True normals (n_plane) and heights where the pixels really look."""
-        points = self._points.reshape(6, *self._shape)
-        return Truth(normal=slope_to_normal(np.stack([points[3], points[4]], axis=-1)),
-                     height=points[2].copy())
 
 
 def make_renderer(scene: str, head: HeadModel, sensor: Sensor | None = None, scale: float = 1.0,
                   seed: int = 1, **parameters: Any) -> Renderer:
     """Renderer for a scene by name, large enough for the head's field of view.
 
-    :param parameters: of the scene.
-    :raises PsError: SEQUENCER_BAD_REQUEST for an unknown scene or parameter.
+    :param scene: one of scenes.SCENES or ring, with arguments if wanted:
+        ``boss:height=0.002,albedo=0.5``.
+    :param parameters: further arguments of the scene.
+    :raises PsError: SEQUENCER_BAD_REQUEST for an unknown scene or argument.
     """
-    rays = camera_rays(scaled_camera(head.camera, 64, 64))
-    reach = head.camera.camera_standoff + _DEEPEST
-    size = tuple(max(least, 2 * float(np.abs(along).max()) * reach + _BORDER)
-                 for least, along in zip(SIZE, rays, strict=True))
-    return Renderer(make_scene(scene, size=(size[0], size[1]), **parameters), head, sensor, scale,
-                    seed)
+    from ps_head_driver.fake.ring_renderer import make_ring_renderer
+    from ps_head_driver.fake.scenes import parse_scene
+    from ps_head_driver.fake.surface_renderer import make_surface_renderer
+    name, arguments = parse_scene(scene)
+    make = make_ring_renderer if name == 'ring' else make_surface_renderer
+    return make(name, {**arguments, **parameters}, head, sensor, scale, seed)

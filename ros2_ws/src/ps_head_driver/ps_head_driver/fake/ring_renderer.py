@@ -6,30 +6,38 @@ walls, slits. Emitters are sampled over each panel and tested one by one, so sof
 by themselves. Shares no code with the calibration.
 """
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 import math
+from typing import Any
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from ps_head_driver.camera_model import camera_center, pixel_rays, scaled_camera
-from ps_head_driver.fake.renderer import Sensor, emitters
+from ps_head_driver.camera_model import camera_center, pixel_rays
+from ps_head_driver.errors import ErrorCode, PsError
+from ps_head_driver.fake.renderer import OFF, Renderer, Sensor, emitters
+from ps_head_driver.fake.scenes import checked_arguments
 from ps_head_driver.fake.shading import KERNEL_LOCK
-from ps_head_driver.head_model import DIRECTIONS, HeadModel
-from ps_head_driver.kinematics import BrightFieldKinematics, PanelPose
+from ps_head_driver.head_model import HeadModel
+from ps_head_driver.kinematics import PanelPose
+from ps_head_driver.stack import Truth
 
 #: Emitters along a panel's width and height, where nothing can stand in the way and elsewhere.
 _FREE, _SHADOWED = (6, 4), (32, 16)
 _PROBES = (7, 5)            # on its edges and inside: where all are free, nothing is in the way
 
-# light on the plate's centre that fills the sensor's range to _LEVEL, see renderer.py
-_REFERENCE_RADIANCE, _LEVEL = 0.014105, 0.6
+
+def _default_dots() -> NDArray:
+    return np.array([[-20.0, -15.0], [20.0, -15.0], [-20.0, 15.0], [20.0, 15.0], [0.0, -17.0],
+                     [12.0, -9.0]]) * 1e-3
 
 
 @dataclass(frozen=True)
 class RingSolid:
     """A half ring on a plate, in its own frame (z out of the plate, ring centre at the origin).
+
+    The defaults are the target shipped with ps_calibration.
 
     :param radii: inner and outer, m.
     :param height: of the wall, m; 0 leaves the plate alone.
@@ -41,15 +49,15 @@ class RingSolid:
     :param reflectance: of the wall, the base and the dots.
     """
 
-    radii: tuple[float, float]
-    height: float
-    arc: tuple[float, float]
-    slits: Sequence[float]
-    slit_width: float
-    plate: tuple[float, float]
-    dots: NDArray
-    dot_radius: float
-    reflectance: tuple[float, float, float]
+    radii: tuple[float, float] = (0.010, 0.012)
+    height: float = 0.004
+    arc: tuple[float, float] = (0.0, math.pi)
+    slits: Sequence[float] = (0.2618, 0.7854, 1.5708, 2.3562, 2.8798)
+    slit_width: float = 0.0008
+    plate: tuple[float, float] = (0.060, 0.050)
+    dots: NDArray = field(default_factory=_default_dots)
+    dot_radius: float = 0.0008
+    reflectance: tuple[float, float, float] = (0.30, 0.80, 0.05)
 
 
 @dataclass(frozen=True)
@@ -221,41 +229,57 @@ def _light(points, free, probes, shadowed, axis, lobe, ring, ends, slits):  # ty
     return out
 
 
-class RingRenderer:
+class RingRenderer(Renderer):
     """Pictures of one target under one head.
 
     :param solid: the target as it really is.
     :param where: the target as it really lies.
-    :param head: the head as it really is.
-    :param sensor: the camera behind the lens.
-    :param scale: picture size relative to the head's camera.
-    :param seed: of the noise.
+
+    The other parameters are those of Renderer.
     """
 
     def __init__(self, solid: RingSolid, where: Placement, head: HeadModel,
                  sensor: Sensor | None = None, scale: float = 1.0, seed: int = 1) -> None:
-        self.head, self.sensor, self.seed = head, sensor or Sensor(), seed
-        self.camera = scaled_camera(head.camera, round(head.camera.width_px * scale),
-                                    round(head.camera.height_px * scale))
+        super().__init__(head, sensor, scale, seed)
         self._where = where
         self._ring = np.array([*solid.radii, solid.height, solid.slit_width / 2])
         self._ends = np.array([f(a) for a in solid.arc for f in (math.cos, math.sin)])
         self._slits = np.array([[math.cos(a), math.sin(a)] for a in solid.slits]).reshape(-1, 2)
-        shape = (self.camera.height_px, self.camera.width_px)
-        v, u = np.mgrid[:shape[0], :shape[1]]
+        v, u = np.mgrid[:self.shape[0], :self.shape[1]]
         rays = pixel_rays(self.camera, np.stack([u, v], axis=-1)).reshape(-1, 3)
         with KERNEL_LOCK:
             self._points = _look(
                 (camera_center(self.camera) - where.position) @ where.rotation,
                 rays @ where.rotation, self._ring, self._ends, self._slits,
-                np.array(solid.plate), np.asarray(solid.dots, np.float64), solid.dot_radius,
-                np.array(solid.reflectance), self.camera.camera_standoff / self.camera.fx)
-        self._shape = shape
-        y, x = np.ogrid[-1:1:shape[0] * 1j, -1:1:shape[1] * 1j]
-        self._gain = (1 - self.sensor.vignetting * (x * x + y * y) / 2).astype(np.float32)
+                np.array(solid.plate), np.asarray(solid.dots, np.float64).reshape(-1, 2),
+                solid.dot_radius, np.array(solid.reflectance),
+                self.camera.camera_standoff / self.camera.fx)
 
-    def panel_radiance(self, pose: PanelPose) -> NDArray:
-        """Radiance towards the camera under one panel, (H, W) float32, without noise."""
+    @property
+    def albedo(self) -> NDArray:
+        """Diffuse reflectance of what each pixel sees, (H, W) float32."""
+        return self._points[:, 6].astype(np.float32).reshape(self.shape)
+
+    def truth(self) -> Truth:
+        """True normals (n_plane) and heights; NaN normals on the vertical walls."""
+        points, where = self._points[:, :3], self._where
+        height = points @ where.rotation[2] + where.position[2]
+        normal = np.tile(where.rotation[:, 2].astype(np.float32), (len(points), 1))
+        normal[(points[:, 2] > 0) & (points[:, 2] < self._ring[2])] = np.nan
+        return Truth(normal=normal.reshape(*self.shape, 3),
+                     height=height.astype(np.float32).reshape(self.shape))
+
+    def warm_up(self) -> None:
+        """Compile the kernels now, not with the first picture."""
+        self._irradiance(self._points[:1], self._bright.panel_pose('E', 0.5))
+
+    def _trace(self, pose: PanelPose) -> NDArray:
+        radiance = (self._irradiance(self._points, pose) * self._points[:, 6]
+                    * pose.intensity / math.pi)
+        return np.asarray(radiance.astype(np.float32).reshape(self.shape))
+
+    def _irradiance(self, points: NDArray, pose: PanelPose) -> NDArray:
+        """Irradiance of points in the target frame under a panel of unit radiance, (N,)."""
         where = self._where
 
         def seen(count: tuple[int, int], gauss: bool) -> NDArray:
@@ -268,13 +292,10 @@ class RingRenderer:
         probes = (pose.center + u[..., None] * pose.right
                   + v[..., None] * np.cross(pose.axis, pose.right)).reshape(-1, 3)
         with KERNEL_LOCK:
-            irradiance = _light(
-                self._points, seen(_FREE, True),
-                (probes - where.position) @ where.rotation, seen(_SHADOWED, False),
-                pose.axis @ where.rotation, pose.lobe_exponent, self._ring, self._ends,
-                self._slits)
-        radiance = irradiance * self._points[:, 6] * pose.intensity / math.pi
-        return radiance.astype(np.float32).reshape(self._shape)
+            return np.asarray(_light(
+                points, seen(_FREE, True), (probes - where.position) @ where.rotation,
+                seen(_SHADOWED, False), pose.axis @ where.rotation, pose.lobe_exponent,
+                self._ring, self._ends, self._slits))
 
     def capture(self, tilt: float, exposure: float = 1.0) -> list[NDArray]:
         """The six pictures of a calibration: E, N, W, S, ALL at a quarter exposure, NONE.
@@ -282,16 +303,40 @@ class RingRenderer:
         :param tilt: of the bright-field panels, rad.
         :param exposure: of the single-light pictures, relative to the sensor's own.
         """
-        kinematics = BrightFieldKinematics(self.head)
-        panels = [self.panel_radiance(kinematics.panel_pose(name, tilt))  # type: ignore[arg-type]
-                  for name in DIRECTIONS]
-        levels = [*panels, 0.25 * np.sum(panels, axis=0), np.zeros(self._shape, np.float32)]
-        room = (self.sensor.ambient * self._points[:, 6]).reshape(self._shape)
-        pictures = []
-        for frame, level in enumerate(levels):
-            room_time = 0.25 if frame == 4 else 1.0
-            total = exposure * (level * (_LEVEL / _REFERENCE_RADIANCE) + room_time * room)
-            pictures.append(self.sensor.expose(
-                (total * self._gain).astype(np.float32), 0.0,
-                np.random.default_rng([self.seed, frame])))
-        return pictures
+        frames: list[tuple[Sequence[float], float]] = [
+            *((list(levels), 1.0) for levels in np.eye(4)), ((1.0,) * 4, 0.25), (OFF, 1.0)]
+        return [self.render(tilt, 0.0, levels, exposure=self.sensor.exposure * exposure * part,
+                            frame=i) for i, (levels, part) in enumerate(frames)]
+
+
+DEFECTS = ('none', 'no_wall', 'turned_over', 'blocked_slit')
+
+
+def make_ring_renderer(name: str, arguments: dict[str, Any], head: HeadModel,
+                       sensor: Sensor | None, scale: float, seed: int) -> RingRenderer:
+    """Renderer of the scene ``ring``: the shipped half ring as it lies under the head.
+
+    :raises PsError: SEQUENCER_BAD_REQUEST for an unknown argument.
+    """
+    solid, where = _ring_scene(**checked_arguments(name, _ring_scene, arguments, given=0))
+    return RingRenderer(solid, where, head, sensor, scale, seed)
+
+
+def _ring_scene(x: float = 0.0, y: float = 0.0, z: float = 0.0, turn: float = 0.0,
+                tilt_x: float = 0.0, tilt_y: float = 0.0, inner_radius: float = 0.010,
+                outer_radius: float = 0.012, height: float = 0.004,
+                defect: str = 'none') -> tuple[RingSolid, Placement]:
+    """The half ring off its place (m, rad), of other dimensions, or with a defect."""
+    if defect not in DEFECTS:
+        raise PsError(ErrorCode.SEQUENCER_BAD_REQUEST,
+                      f'scene ring: defect {defect!r} is not one of {", ".join(DEFECTS)}')
+    solid = RingSolid(radii=(inner_radius, outer_radius), height=height)
+    if defect == 'no_wall':
+        solid = replace(solid, height=0.0)
+    elif defect == 'turned_over':
+        # the plate's blank back, as high as the wall it stands on
+        solid, z = replace(solid, height=0.0, dots=np.empty((0, 2))), z + height
+    elif defect == 'blocked_slit':
+        middle = len(solid.slits) // 2
+        solid = replace(solid, slits=[*solid.slits[:middle], *solid.slits[middle + 1:]])
+    return solid, placement(x, y, z, turn, tilt_x, tilt_y)

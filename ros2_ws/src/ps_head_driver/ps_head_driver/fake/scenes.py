@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_head_driver.fake import shading
+from ps_head_driver.fake import finishes, shading, shapes
 from ps_head_driver.fake.disc import machined_disc
 
 SIZE = (0.064, 0.054)        # m; the nominal field of view is 50 x 40 mm
 PITCH = 5e-5                 # m; a pixel of the nominal camera sees 39 um
+NARROWEST_GLOSS = 0.1        # GGX roughness; emitters are 0.02 rad of half-vector apart
 _MARGIN = 1e-6
 
 
@@ -42,6 +43,15 @@ class Scene:
     albedo: NDArray
     specular: float = 0.0
     roughness: float = 0.3
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.height).all():
+            raise ValueError('its heights are not finite')
+        if not 0 <= self.albedo.min() <= self.albedo.max() <= 1 or not 0 <= self.specular <= 1:
+            raise ValueError('albedo and specular must be 0 to 1')
+        if not NARROWEST_GLOSS <= self.roughness <= 1:
+            raise ValueError(f'the gloss must have a roughness of {NARROWEST_GLOSS} to 1: in a '
+                             'narrower one the single emitters would be seen')
 
     @cached_property
     def height_range(self) -> tuple[float, float]:
@@ -80,57 +90,80 @@ class Scene:
                               'view; give it a larger size')
 
 
-def _plate(x: NDArray, y: NDArray, albedo: float = 0.8, specular: float = 0.0,
-           roughness: float = 0.3) -> dict[str, Any]:
-    """Flat plate in the plane z = 0, matt unless specular is given."""
-    return {'height': np.zeros_like(x), 'albedo': albedo, 'specular': specular,
-            'roughness': roughness}
-
-
-def _tilted_plate(x: NDArray, y: NDArray, tilt_x: float = math.radians(5.0),
-                  tilt_y: float = math.radians(-3.0), albedo: float = 0.8) -> dict[str, Any]:
-    """Flat matt plate that rises by tilt_x (rad) along +x and tilt_y along +y."""
-    return {'height': math.tan(tilt_x) * x + math.tan(tilt_y) * y, 'albedo': albedo}
-
-
-def _dome(x: NDArray, y: NDArray, radius: float = 0.015, height: float = 0.003,
-          albedo: float = 0.8) -> dict[str, Any]:
-    """Spherical cap (m) on a plate in the plane z = 0."""
-    sphere = (radius ** 2 + height ** 2) / (2 * height)
-    z = np.sqrt(np.maximum(sphere ** 2 - x ** 2 - y ** 2, 0)) - (sphere - height)
-    return {'height': np.maximum(z, 0), 'albedo': albedo}
-
-
 _MAKERS: dict[str, Callable[..., dict[str, Any]]] = {
-    'plate': _plate, 'tilted_plate': _tilted_plate, 'dome': _dome, 'disc': machined_disc}
+    'plate': shapes.plate, 'glossy_plate': shapes.glossy_plate,
+    'tilted_plate': shapes.tilted_plate, 'dome': shapes.dome, 'boss': shapes.boss,
+    'disc': machined_disc, 'roughness': finishes.roughness, 'scratches': finishes.scratches,
+    'weld': finishes.weld, 'orange_peel': finishes.orange_peel, 'copper': finishes.copper}
 
-SCENES = tuple(_MAKERS)
+#: All that the fake camera can show; the last is the calibration target, see ring_renderer.py.
+SCENES = (*_MAKERS, 'ring')
 
 
 def make_scene(name: str, size: tuple[float, float] = SIZE, pitch: float = PITCH,
                **parameters: Any) -> Scene:
     """Build a scene by name.
 
-    :param name: one of SCENES.
+    :param name: one of SCENES, except ring.
     :param size: along x and y, centred on the optical axis, m.
     :param pitch: of the grid, m.
-    :param parameters: of the scene; see the functions of this module.
-    :raises PsError: SEQUENCER_BAD_REQUEST for an unknown name or parameter; names those there are.
+    :param parameters: of the scene; see shapes.py, finishes.py and disc.py.
+    :raises PsError: SEQUENCER_BAD_REQUEST for an unknown name or a parameter that is unknown or
+        out of range; names those there are.
     """
     if name not in _MAKERS:
         raise PsError(ErrorCode.SEQUENCER_BAD_REQUEST,
                       f'there is no scene {name!r}; there are {", ".join(SCENES)}')
     maker = _MAKERS[name]
-    known = list(inspect.signature(maker).parameters)[2:]
-    for parameter in parameters:
-        if parameter not in known:
-            raise PsError(ErrorCode.SEQUENCER_BAD_REQUEST,
-                          f'scene {name} has no parameter {parameter!r}; it has '
-                          + ', '.join(known))
+    arguments = checked_arguments(name, maker, parameters, given=2)
     half_x, half_y = (math.ceil(side / 2 / pitch) for side in size)
     x, y = np.meshgrid(np.arange(-half_x, half_x + 1) * pitch,
                        np.arange(-half_y, half_y + 1) * pitch)
-    made = maker(x, y, **parameters)
-    made['height'] = np.ascontiguousarray(made['height'], np.float64)
-    made['albedo'] = np.ascontiguousarray(np.broadcast_to(made['albedo'], x.shape), np.float32)
-    return Scene(name=name, origin=(-half_x * pitch, -half_y * pitch), pitch=pitch, **made)
+    try:
+        made = maker(x, y, **arguments)
+        made['height'] = np.ascontiguousarray(made['height'], np.float64)
+        made['albedo'] = np.ascontiguousarray(np.broadcast_to(made['albedo'], x.shape),
+                                              np.float32)
+        return Scene(name=name, origin=(-half_x * pitch, -half_y * pitch), pitch=pitch, **made)
+    except (ValueError, ArithmeticError) as error:
+        raise PsError(ErrorCode.SEQUENCER_BAD_REQUEST, f'scene {name}: {error}') from error
+
+
+def parse_scene(text: str) -> tuple[str, dict[str, str]]:
+    """Name and arguments of a scene written as ``boss:height=0.002,albedo=0.5``.
+
+    :raises PsError: SEQUENCER_BAD_REQUEST.
+    """
+    name, _, rest = text.partition(':')
+    arguments = {}
+    for part in filter(None, (part.strip() for part in rest.split(','))):
+        key, equals, value = (piece.strip() for piece in part.partition('='))
+        if not (key and equals and value):
+            raise PsError(ErrorCode.SEQUENCER_BAD_REQUEST,
+                          f'scene {text!r}: {part!r} is not of the form name=value')
+        arguments[key] = value
+    return name.strip(), arguments
+
+
+def checked_arguments(scene: str, maker: Callable[..., Any], parameters: dict[str, Any],
+                      given: int) -> dict[str, Any]:
+    """Arguments for a maker, converted to the types of its defaults.
+
+    :param given: how many of the maker's parameters are not the user's.
+    :raises PsError: SEQUENCER_BAD_REQUEST naming the argument and those there are.
+    """
+    known = dict(list(inspect.signature(maker).parameters.items())[given:])
+    checked = {}
+    for name, value in parameters.items():
+        if name not in known:
+            raise PsError(ErrorCode.SEQUENCER_BAD_REQUEST,
+                          f'scene {scene} has no parameter {name!r}; it has ' + ', '.join(known))
+        kind = type(known[name].default)
+        try:
+            checked[name] = kind(value)
+            if kind is float and not math.isfinite(checked[name]):
+                raise ValueError
+        except (TypeError, ValueError):
+            raise PsError(ErrorCode.SEQUENCER_BAD_REQUEST,
+                          f'scene {scene}: {name}={value} is not a {kind.__name__}') from None
+    return checked

@@ -157,6 +157,50 @@ def _enters(x, y, dx, dy, ring, ends, slits, buffer):  # type: ignore[no-untyped
     return 2.0
 
 
+@nb.njit(cache=True, inline='always')
+def _beyond(offset, slope, begin, end):  # type: ignore[no-untyped-def]
+    """Part of begin..end in which offset + s * slope is positive."""
+    if slope == 0.0:
+        return (begin, end) if offset > 0.0 else (1.0, 0.0)
+    s = -offset / slope
+    return (max(begin, s), end) if slope > 0.0 else (begin, min(end, s))
+
+
+@nb.njit(cache=True)
+def _passes_slit(x, y, dx, dy, begin, end, half_width, slits):  # type: ignore[no-untyped-def]
+    """Whether the way from begin to end, all within the ring, lies in one slit."""
+    for k in range(slits.shape[0]):
+        offset = slits[k, 0] * y - slits[k, 1] * x
+        slope = slits[k, 0] * dy - slits[k, 1] * dx
+        if (abs(offset + begin * slope) <= half_width and abs(offset + end * slope) <= half_width
+                and slits[k, 0] * (x + begin * dx) + slits[k, 1] * (y + begin * dy) > 0.0):
+            return True
+    return False
+
+
+@nb.njit(cache=True)
+def _blocked(x, y, dx, dy, ring, ends, slits):  # type: ignore[no-untyped-def]
+    """Whether the way (dx, dy) from (x, y) meets the wall; the same answer as _enters, sooner."""
+    a, b, square = dx * dx + dy * dy, x * dx + y * dy, x * x + y * y
+    within = b * b - a * (square - ring[1] * ring[1])
+    if within <= 0.0 or a <= 0.0:
+        return False
+    root = math.sqrt(within)
+    begin, end = max((-b - root) / a, 0.0), min((-b + root) / a, 1.0)
+    begin, end = _beyond(ends[0] * y - ends[1] * x, ends[0] * dy - ends[1] * dx, begin, end)
+    begin, end = _beyond(ends[3] * x - ends[2] * y, ends[3] * dx - ends[2] * dy, begin, end)
+    if begin >= end:
+        return False
+    # what is left, less the way across the hollow of the ring
+    hollow = b * b - a * (square - ring[0] * ring[0])
+    if hollow <= 0.0:
+        return not _passes_slit(x, y, dx, dy, begin, end, ring[3], slits)
+    root = math.sqrt(hollow)
+    first, last = min((-b - root) / a, end), max((-b + root) / a, begin)
+    return ((begin < first and not _passes_slit(x, y, dx, dy, begin, first, ring[3], slits))
+            or (last < end and not _passes_slit(x, y, dx, dy, last, end, ring[3], slits)))
+
+
 @nb.njit(cache=True, parallel=True)
 def _look(origin, rays, ring, ends, slits, plate, dots, dot_radius, reflectance, pixel):  # type: ignore[no-untyped-def]
     """What each ray of the camera meets, in the target frame.
@@ -175,7 +219,9 @@ def _look(origin, rays, ring, ends, slits, plate, dots, dot_radius, reflectance,
         if met == 0.0:
             out[k] = np.array([x, y, height, 0.0, 0.0, 1.0, reflectance[0]])
         elif met < 1.0:
-            # the wall's own shading is of no use to anybody: give it that of a level face
+            # the wall's own shading is of no use to anybody: give it that of a level face; a
+            # little in front of it, so that it does not shadow itself by chance
+            met -= 1e-6
             out[k] = np.array([x + met * dx, y + met * dy, height * (1.0 - met),
                                0.0, 0.0, 1.0, 0.5 * reflectance[0]])
         else:
@@ -198,7 +244,6 @@ def _light(points, free, probes, shadowed, axis, lobe, ring, ends, slits):  # ty
     out = np.zeros(points.shape[0], np.float32)
     height = ring[2]
     for k in nb.prange(points.shape[0]):
-        buffer = np.empty(32)
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
         radius = math.hypot(x, y)
         # the sides and the middle of the panel tell whether any shadow falls here
@@ -207,24 +252,26 @@ def _light(points, free, probes, shadowed, axis, lobe, ring, ends, slits):  # ty
             for e in range(probes.shape[0]):
                 dx, dy = probes[e, 0] - x, probes[e, 1] - y
                 s = (height - z) / (probes[e, 2] - z)
-                if _enters(x, y, s * dx, s * dy, ring, ends, slits, buffer) < 1.0:
+                if _blocked(x, y, s * dx, s * dy, ring, ends, slits):
                     near = True
                     break
         sources = shadowed if near else free
         total = 0.0
         for e in range(sources.shape[0]):
             dx, dy, dz = sources[e, 0] - x, sources[e, 1] - y, sources[e, 2] - z
-            square = dx * dx + dy * dy + dz * dz
-            distance = math.sqrt(square)
-            cos_e = -(axis[0] * dx + axis[1] * dy + axis[2] * dz) / distance
-            cos_l = (points[k, 3] * dx + points[k, 4] * dy + points[k, 5] * dz) / distance
-            if cos_e <= 0.0 or cos_l <= 0.0:
+            facing = -(axis[0] * dx + axis[1] * dy + axis[2] * dz)
+            steep = points[k, 3] * dx + points[k, 4] * dy + points[k, 5] * dz
+            if facing <= 0.0 or steep <= 0.0:
                 continue
             if near:
                 s = (height - z) / dz
-                if _enters(x, y, s * dx, s * dy, ring, ends, slits, buffer) < 1.0:
+                if _blocked(x, y, s * dx, s * dy, ring, ends, slits):
                     continue
-            total += cos_e ** lobe * cos_l / square * sources[e, 3]
+            square = dx * dx + dy * dy + dz * dz
+            distance = math.sqrt(square)
+            cos_e, cos_l = facing / distance, steep / distance
+            emitted = cos_e if lobe == 1.0 else cos_e ** lobe
+            total += emitted * cos_l / square * sources[e, 3]
         out[k] = total
     return out
 

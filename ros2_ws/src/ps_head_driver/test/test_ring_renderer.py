@@ -1,0 +1,80 @@
+"""The scene of the calibration target: where it lies, what is wrong with it, its shadows."""
+import math
+
+import numpy as np
+import pytest
+
+from ps_head_driver.errors import PsError
+from ps_head_driver.fake.renderer import Sensor, make_renderer
+from ps_head_driver.fake.ring_renderer import _blocked, _enters
+from ps_head_driver.head_model import load_head, nominal_head_path
+
+HEAD = load_head(nominal_head_path())
+CLEAN = Sensor(bit_depth=16, noise=False)
+
+
+def ring(arguments: str = ''):
+    return make_renderer(f'ring:{arguments}', HEAD, CLEAN, scale=0.1)
+
+
+def test_both_shadow_tests_agree():
+    footprint = np.array([0.010, 0.012, 0.004, 0.0004])
+    ends = np.array([1.0, 0.0, -1.0, 0.0])
+    azimuths = np.array([0.3, 1.5, 2.8])
+    slits = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
+    buffer = np.empty(32)
+    answers = []
+    for start, way in np.random.default_rng(1).uniform(-0.02, 0.02, (5000, 2, 2)):
+        blocked = _blocked(*start, *way, footprint, ends, slits)
+        assert blocked == (_enters(*start, *way, footprint, ends, slits, buffer) < 1)
+        answers.append(blocked)
+    assert 500 < sum(answers) < 4500
+
+
+def test_it_lies_where_it_is_put():
+    moved = ring('x=0.004,turn=1.5708,z=-0.001')
+    height = moved.truth().height
+    row, column = np.nonzero(height > 0.0029)       # the crown of the wall
+    camera = moved.camera
+    reach = camera.camera_standoff - 0.003
+    x = (column - camera.cx) / camera.fx * reach
+    y = (camera.cy - row) / camera.fy * reach
+    assert np.hypot(x - 0.004, y) == pytest.approx(0.011, abs=0.0013)
+    assert x.max() < 0.0045         # turned by a quarter: the open side looks to +x
+    assert height.min() == pytest.approx(-0.001)
+
+
+def test_tilt_is_that_of_the_plane():
+    normal = ring('tilt_x=0.02,tilt_y=-0.01').truth().normal[3, 3]
+    assert normal[:2] / normal[2] == pytest.approx([-math.tan(0.02), math.tan(0.01)], abs=1e-6)
+
+
+def test_defects_show():
+    whole, no_wall, turned, blocked = (
+        ring(f'defect={name}') for name in ('none', 'no_wall', 'turned_over', 'blocked_slit'))
+    assert whole.truth().height.max() == pytest.approx(0.004)
+    assert no_wall.truth().height.max() == 0
+    assert no_wall.albedo.min() == pytest.approx(0.05)          # the dots are still there
+    assert turned.albedo.min() == pytest.approx(0.8)            # on the back there are none
+    more = (blocked.truth().height == np.float32(0.004)) & (whole.truth().height == 0)
+    assert 0 < more.sum() < 30
+    with pytest.raises(PsError, match='not a float'):
+        ring('x=left')
+
+
+def test_pictures_of_a_calibration():
+    renderer = ring()
+    pictures = renderer.capture(math.radians(30), 0.8)
+    singles = np.sum([picture.astype(float) for picture in pictures[:4]], axis=0)
+    assert pictures[4] * 4.0 == pytest.approx(singles, abs=5)   # ALL has a quarter exposure
+    assert pictures[5].max() == 0
+    # each panel's shadow lies on the side away from it, outside the ring or in its hollow
+    camera, shape = renderer.camera, renderer.shape
+    v, u = np.mgrid[:shape[0], :shape[1]]
+    x = (u - camera.cx) / camera.fx * camera.camera_standoff
+    y = (camera.cy - v) / camera.fy * camera.camera_standoff
+    hollow = np.hypot(x, y) < 0.0085
+    share = [picture / np.maximum(singles, 1) for picture in pictures[:4]]
+    west, east = hollow & (x < -0.006) & (y > 0.002), hollow & (x > 0.006) & (y > 0.002)
+    assert share[0][east].mean() < 0.8 * share[0][west].mean()
+    assert share[2][west].mean() < 0.8 * share[2][east].mean()

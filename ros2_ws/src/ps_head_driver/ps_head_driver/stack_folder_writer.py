@@ -104,16 +104,20 @@ def _whole(stack: Stack) -> dict[str, Any]:
 
 
 def _light(light: Light) -> dict[str, Any]:
-    """What lights.yaml states of one light."""
-    return {
+    """What lights.yaml states of one light; no geometry where several panels or none were on."""
+    content: dict[str, Any] = {
         'panel': light.panel.name, 'mode': light.mode.name, 'name': light.name,
-        'position': _numbers(light.position), 'axis': _numbers(light.axis),
-        'right': _numbers(light.right), 'size': _numbers(light.size),
-        'lobe_exponent': float(light.lobe_exponent),
-        'intensity': _numbers(light.intensity) if isinstance(light.intensity, tuple)
-        else float(light.intensity),
         'exposure_scale': float(light.exposure_scale), 'distant': light.distant,
         'tilt': float(light.tilt), 'motor_counts': int(light.motor_counts)}
+    if any(light.axis):
+        content |= {
+            'position': _numbers(light.position), 'axis': _numbers(light.axis),
+            'right': _numbers(light.right), 'size': _numbers(light.size),
+            'lobe_exponent': float(light.lobe_exponent)}
+    if np.any(light.intensity):
+        content['intensity'] = (_numbers(light.intensity) if isinstance(light.intensity, tuple)
+                                else float(light.intensity))
+    return content
 
 
 def _numbers(values: Sequence[float]) -> list[float]:

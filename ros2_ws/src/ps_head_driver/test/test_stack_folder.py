@@ -451,3 +451,13 @@ def test_real_four_pictures():
         assert gain.shape[0] <= 512
         assert gain.shape[1] / gain.shape[0] == pytest.approx(width / height, rel=0.01)
     assert max(gain.max() for gain in stack.gain_maps) == 1.0
+
+
+def test_frames_of_all_and_of_no_panel_have_no_geometry(tmp_path):
+    """As the head reports them: zero vectors."""
+    nowhere = (0.0, 0.0, 0.0)
+    lights = [Light(panel=panel, position=nowhere, axis=nowhere, right=nowhere, intensity=level)
+              for panel, level in ((Panel.ALL, 1.0), (Panel.NONE, 0.0))]
+    write_stack(Stack(images=[np.full((8, 9), 7, np.uint8)] * 2, lights=lights), tmp_path / 'out')
+    again = read_stack(tmp_path / 'out')[0]
+    assert [light.panel for light in again.lights] == [Panel.ALL, Panel.NONE]

@@ -183,17 +183,6 @@ def test_wrong_steps_are_answered(client: CellClient):
     assert result.error_code == ErrorCode.SEQUENCER_BAD_REQUEST
 
 
-def test_ring_calibration_says_that_it_is_not_there_yet(client: CellClient):
-    actions = ActionClient(client.node, action.CalibrateRing, 'calibrate_ring')
-    assert actions.wait_for_server(10.0)
-    accepted = wait_for(actions.send_goal_async(action.CalibrateRing.Goal()))
-    result = wait_for(accepted.get_result_async()).result
-    actions.destroy()
-    assert not result.success
-    assert result.error_code == ErrorCode.CALIBRATION_NOT_IMPLEMENTED
-    assert result.verdict == ps.HeadCalibration.VERDICT_FAILED
-
-
 def test_impossible_calibration_message_kills_nobody(cell: Cell, client: CellClient):
     publisher = client.node.create_publisher(
         ps.HeadCalibration, 'calibration', ros_support.LATCHED)

@@ -1,17 +1,29 @@
-"""Node ring_calibration: holds, saves and loads the active calibration."""
+"""Node ring_calibration: makes, holds, saves and loads the active calibration."""
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+import threading
+from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 
+from ps_calibration.calibrate import Calibration, calibrate, head_calibration
+from ps_calibration.nodes.stack_source import StackSource
+from ps_calibration.ring_target import RingTarget, default_target_path, load_target
+from ps_calibration.setup_hint import SetupHint, setup_hint
 from ps_head_driver import ros_support
 from ps_head_driver.calibration_file import HeadCalibration, read_calibration, write_calibration
 from ps_head_driver.conversions import calibration_to_message
 from ps_head_driver.errors import ErrorCode, PsError
+from ps_head_driver.head_model import load_head, nominal_head_path
 from ps_head_driver.ros_support import Parameter, answers
+from ps_head_driver.stack import Panel, Stack
+from ps_head_driver.stack_folder_writer import write_stack
 from ps_interfaces import msg as ps
-from ps_interfaces.action import CalibrateRing
+from ps_interfaces.action import AcquireStack, CalibrateRing
 from ps_interfaces.srv import CalibrationFile
 
 PARAMETERS = [
@@ -21,7 +33,17 @@ PARAMETERS = [
               'geometry', read_only=True),
     Parameter('head_serial', '', 'Refuse calibrations of other heads; empty: the serial number '
               'that head_status reports'),
+    Parameter('head_file', '', 'Head geometry as designed (YAML); empty: the nominal head',
+              read_only=True),
+    Parameter('target_file', '', 'Half-ring target (YAML); empty: the one shipped'),
+    Parameter('convergence_radii', [0.05, 0.0685], 'Convergence radii at which a calibration '
+              'takes its pictures', 'm'),
+    Parameter('exposure', 0.003, 'Exposure of the pictures with one panel', 's', 1e-4, 1.0),
+    Parameter('capture_timeout', 60.0, 'Longest wait for the pictures at one convergence radius',
+              's', 1.0, 600.0),
 ]
+
+_POLL_S = 0.05
 
 
 class RingCalibration(Node):
@@ -35,6 +57,11 @@ class RingCalibration(Node):
         self.active: HeadCalibration | None = None
         self.reported_serial = ''
         self.refused = ''      # why the calibration of the start was dropped
+        self.head = load_head(self.parameters['head_file'] or nominal_head_path())
+        self._busy = threading.Lock()
+        self._cancelled = threading.Event()
+        self._running: ServerGoalHandle | None = None
+        self._source = StackSource(self, self._cancelled)
         self._publisher = self.create_publisher(
             ps.HeadCalibration, 'calibration', ros_support.LATCHED)
         self.create_subscription(
@@ -43,8 +70,8 @@ class RingCalibration(Node):
         self.create_service(CalibrationFile, '~/load', self._on_load)
         self._action = ActionServer(
             self, CalibrateRing, 'calibrate_ring', self._on_calibrate,
-            goal_callback=lambda _: GoalResponse.ACCEPT,
-            cancel_callback=lambda _: CancelResponse.ACCEPT)
+            callback_group=ReentrantCallbackGroup(),
+            goal_callback=lambda _: GoalResponse.ACCEPT, cancel_callback=self._on_cancel)
         ros_support.Diagnostics(self, {'Calibration': self._diagnose},
                                 hardware_id=lambda: self.reported_serial)
         if self.parameters['calibration_file']:
@@ -118,15 +145,144 @@ class RingCalibration(Node):
                           f'calibration {calibration.calibration_id} was made for head '
                           f'{calibration.head_serial!r}, this is {ours!r}')
 
+    # ------------------------------------------------------------------ the action
+
+    def _on_cancel(self, goal: ServerGoalHandle) -> CancelResponse:
+        # a goal that is not running yet looks at its own flag when it gets its turn
+        if self._running is not None and self._running.goal_id == goal.goal_id:
+            self._cancelled.set()
+        return CancelResponse.ACCEPT
+
+    @contextmanager
+    def _exclusive(self, goal: ServerGoalHandle) -> Iterator[None]:
+        if not self._busy.acquire(blocking=False):
+            raise PsError(ErrorCode.CALIBRATION_BUSY, 'another calibration is running')
+        try:
+            self._cancelled.clear()
+            self._running = goal
+            if goal.is_cancel_requested:
+                self._cancelled.set()
+            yield
+        finally:
+            self._running = None
+            self._busy.release()
+
     def _on_calibrate(self, goal: ServerGoalHandle) -> CalibrateRing.Result:
         result = CalibrateRing.Result(verdict=ps.HeadCalibration.VERDICT_FAILED)
-        ros_support.fill_error(result, PsError(
-            ErrorCode.CALIBRATION_NOT_IMPLEMENTED,
-            'the half-ring calibration is not part of this version; load a calibration file with '
-            'ring_calibration/load, or work with nominal geometry'))
-        result.reason = result.message
-        goal.abort()
+        result.calibration = calibration_to_message(None)
+        try:
+            with self._exclusive(goal):
+                self._calibrate(goal, result)
+            result.success = True
+            goal.succeed()
+        except Exception as error:
+            known = ros_support.as_ps_error(self, error, ErrorCode.CALIBRATION_INTERNAL)
+            self.get_logger().warning(f'calibrate_ring: {known.message}')
+            ros_support.fill_error(result, known)
+            result.reason = result.reason or known.message
+            if goal.is_cancel_requested:
+                goal.canceled()
+            else:
+                goal.abort()
         return result
+
+    def _calibrate(self, goal: ServerGoalHandle, result: CalibrateRing.Result) -> None:
+        """Fill the result.
+
+        :raises PsError: CALIBRATION_* with the reason, also for a verdict FAILED.
+        """
+        request = goal.request
+        target = load_target(request.target_file or self.parameters['target_file']
+                             or default_target_path())
+        radii = list(request.convergence_radii or self.parameters['convergence_radii'])
+        if not radii or min(radii) <= 0:
+            raise PsError(ErrorCode.CALIBRATION_BAD_REQUEST,
+                          f'convergence_radii: {radii} must be positive, at least one')
+        keep = self._path(request.working_directory) if request.working_directory else None
+        stacks = self._take_stacks(goal, radii, target, keep)
+        done = len(radii)
+        self._feedback(goal, CalibrateRing.Feedback.FITTING, done, len(radii))
+        fitted = self._in_worker(stacks, target)
+        result.verdict = getattr(ps.HeadCalibration, f'VERDICT_{fitted.verdict}')
+        result.reason = fitted.reason
+        if fitted.fit is not None:
+            result.residuals_px = [float(edge) for edges in fitted.fit.edge_px for edge in edges]
+        serial = self.parameters['head_serial'] or self.reported_serial
+        calibration = head_calibration(fitted, self.head, target, serial)
+        self._feedback(goal, CalibrateRing.Feedback.REPORTING, done, len(radii))
+        path = self.folder / f'{calibration.calibration_id}.yaml'
+        write_calibration(calibration, path)
+        result.calibration = calibration_to_message(calibration)
+        result.message = f'{calibration.verdict}, written to {path}'
+        if request.apply and calibration.verdict == 'OK':
+            self._source.check_cancelled()
+            self.active, self.refused = calibration, ''
+            self._publish()
+            result.message += ' and active'
+        elif request.apply:
+            result.message += '; not made active, load it with ring_calibration/load to do so'
+
+    def _take_stacks(self, goal: ServerGoalHandle, radii: Sequence[float], target: RingTarget,
+                     keep: Path | None) -> list[Stack]:
+        """One stack per convergence radius; the first also tells how well the target lies."""
+        state = CalibrateRing.Feedback
+        stacks: list[Stack] = []
+        hint: SetupHint | None = None
+        with self._source.listening():
+            for number, radius in enumerate(radii):
+                def on_feedback(capture: Any, number: int = number,
+                                hint: SetupHint | None = hint) -> None:
+                    moving = capture.state == AcquireStack.Feedback.MOVING
+                    self._feedback(goal, state.MOVING if moving else state.CAPTURING, number,
+                                   len(radii), hint)
+                stack = self._source.take(self._steps(radius), self.parameters['capture_timeout'],
+                                          on_feedback)
+                if keep is not None:
+                    _keep(stack, keep / f'position_{number + 1}')
+                hint = setup_hint(stack, target)
+                self._feedback(goal, state.DETECTING, number + 1, len(radii), hint)
+                stacks.append(stack)
+        return stacks
+
+    def _steps(self, radius: float) -> list[ps.LightStep]:
+        """Frames of one position; all panels together get a quarter of the exposure."""
+        exposure = self.parameters['exposure']
+        frames = [*((panel, exposure) for panel in (Panel.E, Panel.N, Panel.W, Panel.S)),
+                  (Panel.ALL, exposure / 4), (Panel.NONE, exposure)]
+        return [ps.LightStep(mode=ps.Panel.BRIGHT_FIELD, panel=int(panel),
+                             convergence_radius=float(radius), exposure_time=time)
+                for panel, time in frames]
+
+    def _in_worker(self, stacks: Sequence[Stack], target: RingTarget) -> Calibration:
+        """Fit in a thread of its own: a cancel does not wait for it."""
+        outcome: list[Calibration | Exception] = []
+
+        def work() -> None:
+            try:
+                outcome.append(calibrate(stacks, target, self.head))
+            except Exception as error:
+                outcome.append(error)
+
+        worker = threading.Thread(target=work, name='ring_fit', daemon=True)
+        worker.start()
+        while worker.is_alive():
+            self._source.check_cancelled()
+            worker.join(_POLL_S)
+        if isinstance(outcome[0], Exception):
+            raise outcome[0]
+        return outcome[0]
+
+    @staticmethod
+    def _feedback(goal: ServerGoalHandle, state: int, step: int, total: int,
+                  hint: SetupHint | None = None) -> None:
+        message = CalibrateRing.Feedback(state=state, step=step, total=total)
+        if hint is not None:
+            message.hint_shift_x, message.hint_shift_y = hint.shift
+            message.hint_tilt_x, message.hint_tilt_y = hint.tilt
+            message.hint = hint.text
+        goal.publish_feedback(message)
+
+    # ------------------------------------------------------------------ outputs
 
     def _publish(self) -> None:
         self._publisher.publish(calibration_to_message(self.active))
@@ -140,6 +296,15 @@ class RingCalibration(Node):
         return level, f'{self.active.verdict} {self.active.verdict_reason}'.strip(), {
             'calibration': self.active.calibration_id, 'created': self.active.created,
             'target': self.active.target_name, 'head': self.active.head_serial}
+
+
+def _keep(stack: Stack, folder: Path) -> None:
+    """:raises PsError: CALIBRATION_WRITE_FAILED."""
+    try:
+        write_stack(stack, folder)
+    except PsError as error:
+        raise PsError(ErrorCode.CALIBRATION_WRITE_FAILED,
+                      f'working_directory: {error.message}') from error
 
 
 def main() -> None:

@@ -1,0 +1,196 @@
+"""The calibrate_ring action over DDS, with a fake head that is not what its file says."""
+from collections.abc import Callable, Iterator
+from pathlib import Path
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip('ps_interfaces.msg', reason='needs the built workspace (make setup)')
+
+from rclpy.action import ActionClient
+import yaml
+
+from ps_calibration.graph import NODES as CALIBRATION_NODES
+from ps_calibration.ring_fit import corrected
+from ps_calibration.ring_target import default_target_path, load_target
+from ps_calibration.synthetic import Bench, errors_of, solid_of
+from ps_head_driver.calibration_file import apply, read_calibration
+from ps_head_driver.errors import ErrorCode, PsError
+from ps_head_driver.fake.ring_renderer import RingSolid, placement
+from ps_head_driver.graph import NODES as HEAD_NODES
+from ps_head_driver.head_model import load_head, nominal_head_path
+from ps_head_driver.stack import Plane
+from ps_head_driver.stack_folder import read_stack
+from ps_inspection.cell_client import CellClient
+from ps_inspection.runner import Cell
+from ps_interfaces import srv
+from ps_interfaces.action import CalibrateRing
+from ps_interfaces.msg import HeadCalibration
+
+pytestmark = pytest.mark.graph
+NOMINAL = load_head(nominal_head_path())
+PLACE = {'x': 0.0012, 'y': -0.0008, 'turn': 0.05, 'tilt_x': 0.012, 'tilt_y': -0.008}
+STATE = CalibrateRing.Feedback
+
+
+def true_head():
+    """Panels off by up to 3 mm, 2 degrees and 5 %."""
+    random = np.random.default_rng(12)
+    return corrected(NOMINAL, np.concatenate([
+        random.uniform(-0.003, 0.003, (4, 3)), np.radians(random.uniform(-2, 2, (4, 2))),
+        np.log(random.uniform(0.95, 1.05, (4, 1)))], axis=1))
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp('calibration')
+
+
+@pytest.fixture(scope='module')
+def client(ros_domain: int, folder: Path) -> Iterator[CellClient]:
+    head_file, settings = folder / 'true_head.yaml', folder / 'settings.yaml'
+    head_file.write_text(yaml.safe_dump(true_head().model_dump(mode='json')))
+    settings.write_text(yaml.safe_dump({'/**': {'ros__parameters': {
+        'scale': 0.4, 'true_head_file': str(head_file),
+        'calibration_folder': str(folder / 'files')}}}))
+    scene = 'ring:' + ','.join(f'{name}={value}' for name, value in PLACE.items())
+    arguments = {'fake_hardware': 'true', 'camera': 'fake', 'scene': scene,
+                 'params_file': str(settings)}
+    with Cell(arguments, (*HEAD_NODES, *CALIBRATION_NODES), folder / 'logs') as cell:
+        with CellClient() as connected:
+            connected.home()
+            yield connected
+        cell.check()
+
+
+def calibrate(client: CellClient, at: int | None = None,
+              meanwhile: Callable[[Any], None] = lambda _: None,
+              **goal: Any) -> tuple[CalibrateRing.Result, list]:
+    """Run the action.
+
+    :param at: stage at which ``meanwhile`` is called with the goal.
+    :returns: result and all feedback.
+    """
+    actions = ActionClient(client.node, CalibrateRing, 'calibrate_ring')
+    feedback: list = []
+    reached, done = threading.Event(), threading.Event()
+
+    def on_feedback(message: Any) -> None:
+        feedback.append(message.feedback)
+        if message.feedback.state == at:
+            reached.set()
+
+    try:
+        assert actions.wait_for_server(20.0)
+        sending, accepted = actions.send_goal_async(
+            CalibrateRing.Goal(**goal), feedback_callback=on_feedback), threading.Event()
+        sending.add_done_callback(lambda _: accepted.set())
+        assert accepted.wait(20)
+        handle = sending.result()
+        getting = handle.get_result_async()
+        getting.add_done_callback(lambda _: done.set())
+        if at is not None:
+            for _ in range(600):
+                if reached.wait(0.1) or done.is_set():
+                    break
+            assert reached.is_set(), getting.result().result.message
+            meanwhile(handle)
+        assert done.wait(120)
+        return getting.result().result, feedback
+    finally:
+        actions.destroy()
+
+
+def test_the_ring_scene_is_the_shipped_target() -> None:
+    scene, target = RingSolid(), solid_of(load_target(default_target_path()))
+    for name, value in vars(target).items():
+        np.testing.assert_allclose(getattr(scene, name), value)
+
+
+def test_calibration_brings_the_lights_closer_to_the_truth(
+        client: CellClient, folder: Path) -> None:
+    assert client.stack(client.capture()).calibration_id == ''
+
+    def still_answers(_: Any) -> None:
+        begin = time.monotonic()
+        with pytest.raises(PsError) as refused:
+            client.call(srv.CalibrationFile, 'ring_calibration/save',
+                        srv.CalibrationFile.Request(file='x.yaml'))
+        assert refused.value.code == ErrorCode.CALIBRATION_NONE_ACTIVE
+        assert time.monotonic() - begin < 2.0
+        second, _ = calibrate(client)
+        assert second.error_code == ErrorCode.CALIBRATION_BUSY
+
+    result, feedback = calibrate(client, STATE.FITTING, still_answers, apply=True,
+                                 convergence_radii=[0.06], working_directory='pictures')
+    assert result.success, result.message
+    assert result.verdict == HeadCalibration.VERDICT_OK, result.reason
+    assert len(result.residuals_px) == 4
+    # stages come in order, and say how to centre the target
+    states = [message.state for message in feedback]
+    assert set(states) == {STATE.MOVING, STATE.CAPTURING, STATE.DETECTING, STATE.FITTING,
+                           STATE.REPORTING}
+    hint = next(message for message in feedback if message.state == STATE.DETECTING)
+    assert hint.hint_shift_x == pytest.approx(-PLACE['x'], abs=1e-4)
+    assert hint.hint_shift_y == pytest.approx(-PLACE['y'], abs=1e-4)
+    assert 'in place' in hint.hint
+
+    identifier = result.calibration.calibration_id
+    calibration = read_calibration(folder / 'files' / f'{identifier}.yaml')
+    place = placement(**PLACE)
+    stack = read_stack(folder / 'files' / 'pictures' / 'position_1')[0]
+    bench = Bench(true_head(), place)
+    tilt = stack.lights[0].tilt
+    before = errors_of(NOMINAL, Plane(), bench, tilt)
+    plane = Plane(calibration.plane_normal, calibration.plane_offset)
+    after = errors_of(apply(NOMINAL, calibration), plane, bench, tilt)
+    assert after.direction_deg.max() < 0.15 < before.direction_deg.max()
+    assert np.abs(after.intensity).max() < 0.01 < np.abs(before.intensity).max()
+    assert after.level_deg < 0.06 < before.level_deg
+    assert client.stack(client.capture()).calibration_id == identifier
+
+
+@pytest.mark.parametrize('stage', [STATE.CAPTURING, STATE.FITTING])
+def test_cancel(client: CellClient, stage: int) -> None:
+    active = client.stack(client.capture()).calibration_id
+    begin: list[float] = []
+
+    def cancel(goal: Any) -> None:
+        begin.append(time.monotonic())
+        goal.cancel_goal_async()
+
+    result, feedback = calibrate(client, stage, cancel, apply=True)
+    if stage == STATE.FITTING:      # all positions of the parameter have been visited
+        assert (feedback[-1].step, feedback[-1].total) == (2, 2)
+    assert time.monotonic() - begin[0] < 5.0
+    assert result.error_code == ErrorCode.CALIBRATION_CANCELLED, result.message
+    assert result.verdict == HeadCalibration.VERDICT_FAILED
+    client.wait_until_ready(5.0)
+    assert client.stack(client.capture()).calibration_id == active
+
+
+@pytest.mark.parametrize(('goal', 'code', 'reason'), [
+    ({'target_file': 'nowhere.yaml'}, ErrorCode.CALIBRATION_BAD_REQUEST, 'nowhere'),
+    ({'convergence_radii': [-0.05]}, ErrorCode.CALIBRATION_BAD_REQUEST, 'positive'),
+    ({'convergence_radii': [1000.0]}, ErrorCode.CALIBRATION_CAPTURE_FAILED, 'UNREACHABLE'),
+    ({'working_directory': '../x'}, ErrorCode.CALIBRATION_BAD_REQUEST, 'leaves'),
+])
+def test_wrong_goals_are_answered(client: CellClient, goal: dict, code: ErrorCode,
+                                  reason: str) -> None:
+    result, _ = calibrate(client, **goal)
+    assert result.error_code == code, result.message
+    assert reason in result.message
+    assert result.reason == result.message
+
+
+def test_another_target_is_not_found(client: CellClient, tmp_path: Path) -> None:
+    content = yaml.safe_load(default_target_path().read_text())
+    content['fiducials']['centres'][5] = [-0.012, -0.009]
+    content['fiducials']['centres'][4] = [0.004, -0.017]
+    path = tmp_path / 'other.yaml'
+    path.write_text(yaml.safe_dump(content))
+    result, _ = calibrate(client, target_file=str(path), convergence_radii=[0.06])
+    assert result.error_code == ErrorCode.CALIBRATION_TARGET_NOT_FOUND, result.message

@@ -1,0 +1,122 @@
+"""Calibration of the motor: from tilts measured at several counts to a crank-slider that meets CR.
+
+The slider's counts are corrected by an offset and a scale, and the crank by its phase; the four
+panels' common tilt cannot tell more (a longer rod or crank looks the same over the range used, and
+is taken up by these). Free play makes the slider stand ``backlash`` counts higher after a motion
+down than after one up. What remains is the repeatability.
+"""
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from ps_head_driver.errors import ErrorCode, PsError
+from ps_head_driver.head_model import HeadModel
+from ps_head_driver.kinematics import BrightFieldKinematics
+
+# what is plausible: offset (counts), scale, phase of the crank (rad), backlash (counts)
+_PRIOR = np.array([2000.0, 0.02, 0.05, 2000.0])
+_TILT_NOISE = 1e-4              # rad, of a tilt from a ring calibration
+
+
+@dataclass(frozen=True)
+class TiltReading:
+    """One measured position.
+
+    :param motor_counts: of the encoder.
+    :param tilt: common to the four panels, as a ring calibration finds it, rad.
+    :param approach: last direction of motion.
+    """
+
+    motor_counts: int
+    tilt: float
+    approach: Literal['up', 'down'] = 'up'
+
+
+@dataclass(frozen=True)
+class MotorCalibration:
+    """What the motor does.
+
+    :param offset_counts: to add to the counts at m0_counts.
+    :param scale: true slider travel over nominal.
+    :param crank_offset: to add to the crank's offset, rad.
+    :param backlash_counts: the slider stands this much higher after a motion down; NaN if only
+        one direction was measured.
+    :param repeatability_counts: standard deviation of what is left.
+    """
+
+    offset_counts: float
+    scale: float
+    crank_offset: float
+    backlash_counts: float
+    repeatability_counts: float
+
+    def corrected(self, head: HeadModel) -> HeadModel:
+        """The head with these kinematics, for positions approached from below (up)."""
+        return _moved(head, self.offset_counts, self.scale - 1, self.crank_offset)
+
+    def counts_for(self, head: HeadModel, tilt: float, approach: str = 'up') -> int:
+        """Motor counts to command for a tilt (rad) when arriving from one side.
+
+        :param head: as it was before the correction.
+        :raises PsError: HEAD_OUT_OF_LIMITS.
+        """
+        counts = float(BrightFieldKinematics(self.corrected(head)).motor_position(tilt))
+        play = self.backlash_counts if approach == 'down' and np.isfinite(
+            self.backlash_counts) else 0.0
+        return round(counts - play)
+
+
+def calibrate_motor(readings: Sequence[TiltReading], head: HeadModel) -> MotorCalibration:
+    """Fit the motor's parameters.
+
+    :param readings: at least three different counts; both approaches for the backlash.
+    :raises PsError: CALIBRATION_BAD_REQUEST if the readings do not suffice or lie outside the
+        motor's range.
+    """
+    code = ErrorCode.CALIBRATION_BAD_REQUEST
+    counts = np.array([reading.motor_counts for reading in readings], np.float64)
+    tilts = np.array([reading.tilt for reading in readings])
+    down = np.array([reading.approach == 'down' for reading in readings])
+    if len(np.unique(counts)) < 3:
+        raise PsError(code, 'the motor needs pictures at three or more motor positions, '
+                            f'{len(np.unique(counts))} given')
+    if not np.isfinite(tilts).all():
+        raise PsError(code, 'tilt: not all numbers are finite')
+    both = down.any() and not down.all()
+
+    def predicted(x: NDArray) -> NDArray:
+        kinematics = BrightFieldKinematics(_moved(head, *x[:3]))
+        low, high = kinematics.limits_counts
+        wanted = counts + x[3] * down
+        # beyond the soft limits the tilt goes on as at the limit, in a straight line
+        inside = np.clip(wanted, low, high)
+        return np.asarray(kinematics.tilt(inside)
+                          + kinematics.dtilt_dm(inside) * (wanted - inside))
+
+    def residuals(x: NDArray) -> NDArray:
+        return np.concatenate([(predicted(x) - tilts) / _TILT_NOISE, x / _PRIOR])
+
+    fit = least_squares(residuals, np.zeros(4), x_scale=[100.0, 1e-3, 1e-3, 100.0])
+    kinematics = BrightFieldKinematics(_moved(head, *fit.x[:3]))
+    left = (predicted(fit.x) - tilts) / abs(kinematics.dtilt_dm(
+        np.clip(counts, *kinematics.limits_counts)))
+    freedom = max(len(counts) - 3 - both, 1)
+    return MotorCalibration(float(fit.x[0]), 1 + float(fit.x[1]), float(fit.x[2]),
+                            float(fit.x[3]) if both else float('nan'),
+                            float(np.sqrt(np.sum(left**2) / freedom)))
+
+
+def _moved(head: HeadModel, offset: float, scale_error: float, phase: float) -> HeadModel:
+    """Head whose slider stands ``offset`` counts further, and moves (1 + scale_error) as far."""
+    field, slider = head.bright_field, head.bright_field.slider
+    per_metre = slider.counts_per_metre / (1 + scale_error)
+    shifted = slider.model_copy(update={
+        'counts_per_metre': per_metre,
+        'z_at_m0': slider.z_at_m0 + slider.direction * offset / per_metre})
+    crank = field.crank.model_copy(update={'offset': field.crank.offset + phase})
+    return head.model_copy(update={'bright_field': field.model_copy(
+        update={'slider': shifted, 'crank': crank})})

@@ -25,6 +25,7 @@ setup(
         'console_scripts': [
             'ring_calibration = ps_calibration.nodes.ring_calibration:main',
             'ps_calibrate = ps_calibration.cli.ps_calibrate:main',
+            'ps_ring_target = ps_calibration.cli.ps_ring_target:main',
         ],
     },
 )

@@ -37,6 +37,7 @@ class Base(_Section):
 
     size: tuple[Length, Length]
     reflectance: Reflectance
+    thickness: Length = 0.003        # for manufacture only
 
 
 class Fiducials(_Section):

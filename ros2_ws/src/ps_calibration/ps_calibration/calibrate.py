@@ -14,6 +14,7 @@ from ps_calibration.detection import find_dots
 from ps_calibration.ring_fit import (
     RingFit,
     Shares,
+    blocked_slits,
     corrected,
     fit_ring,
     measure_shares,
@@ -22,6 +23,7 @@ from ps_calibration.ring_fit import (
 from ps_calibration.ring_target import RingTarget
 from ps_calibration.target_pose import TargetPose, camera_to_plane, fit_pose
 from ps_head_driver.calibration_file import HeadCalibration, PanelCorrection, new_calibration_id
+from ps_head_driver.camera_model import scaled_camera
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import DIRECTIONS, CameraGeometry, HeadModel
 from ps_head_driver.kinematics import BrightFieldKinematics, PanelPose
@@ -34,6 +36,8 @@ _MOVED_PX = 0.3          # of a dot, between two pictures
 _FAILED_RMS, _POOR_RMS = 0.02, 0.006     # of the shares of light
 _UNLIKELY = 1.7          # corrections, relative to the tolerances they were given
 _Z_SCALE = 0.03          # of the wall's height, before the target is doubted
+_NO_WALL = 0.4           # of the wall's height, below which there is none
+_BLOCKED = 0.5           # of a slit
 _LIMIT = np.array([0.006, 0.006, 0.006, 0.07, 0.07, 0.25])
 
 
@@ -70,20 +74,20 @@ class Calibration:
 def calibrate(stacks: Sequence[Stack], target: RingTarget, head: HeadModel) -> Calibration:
     """Calibrate the bright-field panels of a head.
 
-    :param stacks: one per motor position, frames E, N, W, S, ALL, NONE in any order; motor_counts
-        in every light, exposure_scale used.
+    :param stacks: one per motor position, frames E, N, W, S, ALL, NONE in any order, 8 to 16 bit;
+        motor_counts in every light (without, its axis tells the tilt), exposure_scale used.
     :param head: as designed.
     :returns: a FAILED verdict if the pictures do not allow a calibration.
     :raises PsError: CALIBRATION_BAD_REQUEST if frames or the camera are missing.
     """
-    camera = _common_camera(stacks)
+    camera = _common_camera(stacks, head)
     clock = {'start': time.perf_counter()}
     try:
         captures = [_light_only(stack) for stack in stacks]
         dots_px, pose = _locate(captures, target, camera)
         clock['detect'] = time.perf_counter()
         kinematics = BrightFieldKinematics(head)
-        shares = [measure_shares(capture[:4], float(kinematics.tilt(_counts(stack))), pose, target,
+        shares = [measure_shares(capture[:4], _nominal_tilt(stack, kinematics), pose, target,
                                  camera)
                   for capture, stack in zip(captures, stacks, strict=True)]
         for position in shares:
@@ -97,8 +101,9 @@ def calibrate(stacks: Sequence[Stack], target: RingTarget, head: HeadModel) -> C
                               ErrorCode.CALIBRATION_CAPTURE_FAILED):
             raise
         return Calibration('FAILED', error.message, camera)
-    z_scale = target.height / free.height
-    verdict, reason = _judge(fit, z_scale)
+    z_scale = target.height / max(free.height, 1e-2 * target.height)
+    blocked = blocked_slits(fit, head, target, camera, shares)
+    verdict, reason = _judge(fit, free, target, blocked)
     names = list(clock)
     timings = {name: clock[name] - clock[before]
                for before, name in pairwise(names)}
@@ -139,18 +144,37 @@ def _version() -> str:
         return ''
 
 
-def _common_camera(stacks: Sequence[Stack]) -> CameraGeometry:
-    code = ErrorCode.CALIBRATION_BAD_REQUEST
-    cameras = {stack.camera for stack in stacks}
-    camera = stacks[0].camera if stacks else None
-    if camera is None or len(cameras) != 1:
-        raise PsError(code, 'the pictures need the intrinsics of one camera, the same in all '
-                            'folders (lights.yaml: camera)')
-    return camera
+def _common_camera(stacks: Sequence[Stack], head: HeadModel) -> CameraGeometry:
+    """Intrinsics of the pictures; where they state none, those of the head."""
+    if not stacks:
+        raise PsError(ErrorCode.CALIBRATION_BAD_REQUEST, 'no pictures given')
+    cameras = [stack.camera or scaled_camera(head.camera, *reversed(stack.shape))
+               for stack in stacks]
+    for k, camera in enumerate(cameras):
+        if camera != cameras[0]:
+            raise PsError(ErrorCode.CALIBRATION_BAD_REQUEST,
+                          f'position {k + 1}: another camera or picture size than position 1; '
+                          'calibrate with one camera (lights.yaml: camera)')
+    return cameras[0]
 
 
-def _counts(stack: Stack) -> int:
-    return next(light.motor_counts for light in stack.lights if light.panel == Panel.E)
+def _nominal_tilt(stack: Stack, kinematics: BrightFieldKinematics) -> float:
+    """From the motor counts; where the pictures state none, from the lights' own axes, rad."""
+    light = next(light for light in stack.lights
+                 if light.panel == Panel.E and light.mode == Mode.BRIGHT_FIELD)
+    if light.motor_counts:
+        return float(kinematics.tilt(light.motor_counts))
+    return math.acos(min(max(-light.axis[2], -1.0), 1.0))
+
+
+def _range_of(images: Sequence[NDArray]) -> float:
+    """End of the grey values' range; cameras deliver 10, 12 or 14 bit in words of 16."""
+    if not np.issubdtype(images[0].dtype, np.integer):
+        return math.inf
+    if images[0].dtype == np.uint8:
+        return 255.0
+    highest = max(int(image.max()) for image in images)
+    return float(next(2**bits - 1 for bits in (10, 12, 14, 16) if highest < 2**bits))
 
 
 def _frame(stack: Stack, panel: Panel) -> tuple[NDArray, float]:
@@ -172,7 +196,7 @@ def _light_only(stack: Stack) -> list[NDArray]:
     """
     code, name = ErrorCode.CALIBRATION_CAPTURE_FAILED, stack.stack_id or 'pictures'
     dark, dark_scale = _frame(stack, Panel.NONE)
-    full = float(np.iinfo(dark.dtype).max) if np.issubdtype(dark.dtype, np.integer) else math.inf
+    full = _range_of(stack.images)
     frames = []
     for panel in (Panel.E, Panel.N, Panel.W, Panel.S, Panel.ALL):
         image, scale = _frame(stack, panel)
@@ -222,11 +246,31 @@ def _require_labels(measured: Shares, predicted: NDArray) -> None:
                           'camera is turned')
 
 
-def _judge(fit: RingFit, z_scale: float) -> tuple[str, str]:
-    rms = max(float(np.sqrt(np.mean(r**2))) for r in fit.residuals)
+def _rms(fit: RingFit) -> float:
+    return max(float(np.sqrt(np.mean(r**2))) for r in fit.residuals)
+
+
+def _judge(fit: RingFit, free: RingFit, target: RingTarget, blocked: NDArray) -> tuple[str, str]:
+    """The most specific reason that the fits give.
+
+    :param free: the fit with a free height of the wall.
+    :param blocked: of each slit, see blocked_slits.
+    """
+    rms, height = _rms(fit), free.height / target.height
+    if height < _NO_WALL:
+        return 'FAILED', ('no shadows of the wall are seen; is the half ring missing from its '
+                          'plate, or a lower one?')
+    if blocked.max() > _BLOCKED and rms < _FAILED_RMS:
+        azimuth = math.degrees(target.slits.azimuths[int(blocked.argmax())])
+        return 'FAILED', (f'the slit at {azimuth:.0f} degrees lets no light through; clean it, or '
+                          'check the target file')
+    if abs(height - 1) > _Z_SCALE and _rms(free) < max(0.8 * rms, _POOR_RMS):
+        return ('FAILED' if rms > _FAILED_RMS else 'POOR'), (
+            f'the wall seems to be {height:.3f} times as high as the target file says; check '
+            'that it is the right target and the file')
     if rms > _FAILED_RMS:
-        return 'FAILED', (f'the shadows do not fit this target (residual {rms:.3f}): is the ring '
-                          'missing, another one, or dirty?')
+        return 'FAILED', (f'the shadows do not fit this target (residual {rms:.3f}); is it '
+                          'another ring than the target file says, or damaged?')
     beyond = abs(fit.panels) > _LIMIT * _UNLIKELY
     if beyond.any():
         name = DIRECTIONS[int(np.argmax(beyond.any(axis=1)))]
@@ -234,7 +278,4 @@ def _judge(fit: RingFit, z_scale: float) -> tuple[str, str]:
     if rms > _POOR_RMS:
         return 'POOR', (f'the shadows fit badly (residual {rms:.3f}); clean the target and keep '
                         'other light away')
-    if abs(z_scale - 1) > _Z_SCALE:
-        return 'POOR', (f'the wall seems to be {1 / z_scale:.3f} times as high as the target '
-                        'file says; check the file')
     return 'OK', ''

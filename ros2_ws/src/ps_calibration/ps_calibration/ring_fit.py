@@ -8,6 +8,7 @@ loss, starting from the kinematics.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +29,14 @@ _TILT_PRIOR = 0.03                       # rad, error of the motor between two p
 _STEPS = np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3])        # of finite differences
 _POSE_STEPS = np.array([1e-5, 1e-5, 1e-5, 1e-3, 5e-4, 5e-4])
 _HEIGHT_STEP, _TILT_STEP = 2e-5, 1e-3
-# the dots weigh more than their noise asks for: small errors of the light's model, the same in
-# thousands of blocks, must not tilt the plane
-_SHARE_NOISE, _DOT_NOISE_PX = 0.002, 0.001
+# what is expected of the models of soft shadows near the wall and of the smooth rest. The dots
+# weigh more than their noise asks for: errors of the soft shadows, alike in many blocks, must not
+# tilt the plane
+_MODEL_NEAR, _MODEL_FAR, _DOT_NOISE_PX = 1e-3, 5e-5, 0.001
 _CLEAR = 0.0006          # m; the camera looks past the wall's edge, and a block has a width
-_BLOCK = 1.6e-4          # m on the plate, edge of the blocks of pixels that are averaged
-_REACH = 0.006           # m; no shadow is longer; beyond, a few blocks are enough
+_BLOCK = 1.6e-4          # m on the plate, edge of the smallest blocks of pixels
+_REACH = 0.006           # m; no shadow is longer
+_PART, _FAR = 7, 6       # one block in _PART is used up to there; beyond, _FAR x _FAR are averaged
 _SOFT = 3.0              # standard deviations from which on a residual counts less
 
 
@@ -44,11 +47,13 @@ class Shares:
     :param tilt: nominal, rad.
     :param pixels: (N, 2) float64, column and row of the middles of the blocks.
     :param values: (4, N) float64, share of E, N, W, S in their sum.
+    :param noise: (N,) float64, standard deviation expected of them.
     """
 
     tilt: float
     pixels: NDArray
     values: NDArray
+    noise: NDArray
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,9 @@ class RingFit:
     :param height: of the wall, m: fitted or as given.
     :param residuals: per position (4, N) measured minus predicted share.
     :param edge_px: per position (4,) what the residuals amount to as a shift of the shadow edges.
+    :param scatter: of the residuals relative to the noise expected, robust, at least 1.
     :param deviation: (4, PER_PANEL) standard deviations from the covariance.
+    :param pose_deviation: (SIZE,) the same of the pose.
     """
 
     panels: NDArray
@@ -71,7 +78,9 @@ class RingFit:
     height: float
     residuals: list[NDArray]
     edge_px: list[NDArray]
+    scatter: float
     deviation: NDArray
+    pose_deviation: NDArray
 
 
 def corrected(head: HeadModel, panels: NDArray) -> HeadModel:
@@ -106,14 +115,42 @@ def measure_shares(pictures: Sequence[NDArray], tilt: float, pose: TargetPose,
     x, y = points[:, 0], points[:, 1]
     half = np.array(target.base.size) / 2 - _CLEAR
     total = blocks.sum(axis=0)
-    keep = (target.distance(x, y) > _CLEAR) & (np.hypot(x, y) > _CLEAR) & (
+    distance = target.distance(x, y)
+    keep = (distance > _CLEAR) & (np.hypot(x, y) > _CLEAR) & (
         abs(x) < half[0]) & (abs(y) < half[1]) & (total > 0.1 * np.median(total))
     for dot in target.fiducials.centres:
         keep &= np.hypot(x - dot[0], y - dot[1]) > target.fiducials.radius + _CLEAR / 2
+    grid = np.concatenate([blocks, pixels.T]).reshape(6, rows, columns)
+    parts = []
     i, j = (pixels // side).astype(int).T
-    keep &= np.where(target.distance(x, y) < _REACH, (i + 3 * j) % 7 == 0,
-                     (i % 6 == 0) & (j % 6 == 0))
-    return Shares(tilt, pixels[keep], blocks[:, keep] / total[keep])
+    for size, here in ((1, (distance < _REACH) & ((i + 3 * j) % _PART == 0)),
+                       (_FAR, distance >= _REACH)):
+        whole = _merge((keep & here).reshape(1, rows, columns), size)[0] == 1
+        parts.append(_merge(grid, size)[:, whole])
+    merged = np.concatenate(parts, axis=1)
+    values = merged[:4] / merged[:4].sum(axis=0)
+    return Shares(tilt, merged[4:].T.copy(), values,
+                  _noise([part[:4] / part[:4].sum(axis=0) for part in parts]))
+
+
+def _merge(grid: NDArray, size: int) -> NDArray:
+    """Means of size x size neighbours, (K, H, W) to (K, H // size, W // size)."""
+    rows, columns = (n // size for n in grid.shape[1:])
+    return np.asarray(grid[:, :rows * size, :columns * size].reshape(
+        -1, rows, size, columns, size).mean(axis=(2, 4), dtype=np.float64))
+
+
+def _noise(parts: Sequence[NDArray]) -> NDArray:
+    """Standard deviation of each share: its pixels' noise and the model's own errors, (N,).
+
+    The noise is seen in the differences of neighbours far from the wall.
+    """
+    far = parts[1]
+    change = np.diff(far, 2, axis=1)[:, np.abs(np.diff(far, 2, axis=1)).max(axis=0) < 0.05]
+    pixel = 1.4826 * float(np.median(abs(change))) / math.sqrt(6) if change.size else 0.0
+    return np.concatenate([
+        np.full(parts[0].shape[1], math.hypot(pixel * _FAR, _MODEL_NEAR)),
+        np.full(far.shape[1], math.hypot(pixel, _MODEL_FAR))])
 
 
 class _Problem:
@@ -165,7 +202,7 @@ class _Problem:
 
     def residuals(self, x: NDArray) -> NDArray:
         """Normalised by the noise expected."""
-        parts = [((light / light.sum(axis=0) - share.values) / _SHARE_NOISE).ravel()
+        parts = [((light / light.sum(axis=0) - share.values) / share.noise).ravel()
                  for light, share in zip(self.lights(x), self.shares, strict=True)]
         dots = dot_errors(self.pose(x).numbers, self.dots_px, self.target, self.camera)
         return np.concatenate([*parts, dots / _DOT_NOISE_PX, x / self.prior])
@@ -202,7 +239,7 @@ class _Problem:
                         ) else self.panel_light(moved, position, panel)
                         change[panel] = (after - light[panel]) / step
                 share = (change - light / total * change.sum(axis=0)) / total
-                parts.append(share.ravel() / _SHARE_NOISE)
+                parts.append((share / self.shares[position].noise).ravel())
             dots = np.zeros(self.dots_px.size)
             if 4 * PER_PANEL <= k < self.first_tilt:
                 dots = (dot_errors(self.pose(moved).numbers, self.dots_px, self.target,
@@ -249,7 +286,7 @@ def fit_ring(head: HeadModel, target: RingTarget, camera: CameraGeometry,
     if free_height:
         x[-1] = target.height
     fit = least_squares(problem.residuals, x, problem.jacobian, loss=problem.loss,
-                        x_scale=problem.scale, max_nfev=10, xtol=1e-6, ftol=1e-4)
+                        x_scale=problem.scale, max_nfev=15, xtol=1e-8, ftol=1e-7)
     return _summary(problem, fit.x, fit.jac)
 
 
@@ -257,22 +294,28 @@ def _summary(problem: _Problem, x: NDArray, jacobian: NDArray) -> RingFit:
     lights = problem.lights(x)
     residuals = [share.values - light / light.sum(axis=0)
                  for light, share in zip(lights, problem.shares, strict=True)]
-    scatter = 1.4826 * np.median(abs(np.concatenate([r.ravel() for r in residuals])))
-    covariance = np.linalg.inv(jacobian.T @ jacobian) * (scatter / _SHARE_NOISE)**2
-    deviation = np.sqrt(np.diag(covariance))[:4 * PER_PANEL].reshape(4, PER_PANEL)
+    normalised = np.concatenate([(r / share.noise).ravel()
+                                 for r, share in zip(residuals, problem.shares, strict=True)])
+    scatter = max(1.4826 * float(np.median(abs(normalised))), 1.0)
+    # a wall that is not there leaves its height undetermined
+    covariance = np.linalg.pinv(jacobian.T @ jacobian) * scatter**2
+    deviation = np.sqrt(np.diag(covariance))
     metres_per_pixel = problem.camera.camera_standoff / problem.camera.fx
-    moved_x, moved_y = (jacobian[:, 4 * PER_PANEL + k] * _SHARE_NOISE for k in range(2))
     edge_px, first = [], 0
-    for r in residuals:
+    for r, share in zip(residuals, problem.shares, strict=True):
         last = first + r.size
-        steep = np.hypot(moved_x[first:last], moved_y[first:last]).reshape(r.shape)
+        moved_x, moved_y = (jacobian[first:last, 4 * PER_PANEL + k].reshape(r.shape) * share.noise
+                            for k in range(2))
+        steep = np.hypot(moved_x, moved_y)
         edges = steep > 0.3 * steep.max(axis=1, keepdims=True)
         edge_px.append(np.sqrt(np.sum(r**2 * edges, axis=1) / np.sum(steep**2 * edges, axis=1))
                        / metres_per_pixel)
         first = last
     panels = x[:4 * PER_PANEL].reshape(4, PER_PANEL).copy()
     return RingFit(panels, [problem.tilt(x, k) for k in range(len(lights))], problem.pose(x),
-                   problem.height(x), residuals, edge_px, deviation)
+                   problem.height(x), residuals, edge_px, scatter,
+                   deviation[:4 * PER_PANEL].reshape(4, PER_PANEL),
+                   deviation[4 * PER_PANEL:problem.first_tilt])
 
 
 def predicted_shares(head: HeadModel, target: RingTarget, camera: CameraGeometry,
@@ -283,3 +326,26 @@ def predicted_shares(head: HeadModel, target: RingTarget, camera: CameraGeometry
     x[4 * PER_PANEL:problem.first_tilt] = pose.numbers
     light = problem.lights(x)[0]
     return np.asarray(light / light.sum(axis=0))
+
+
+def blocked_slits(fit: RingFit, head: HeadModel, target: RingTarget, camera: CameraGeometry,
+                  shares: Sequence[Shares]) -> NDArray:
+    """How far each slit is closed: 0 is open, 1 is blocked, (S,) float64.
+
+    The residuals are compared with the change that filling the slit would make.
+    """
+    problem = _Problem(head, target, camera, shares, np.zeros((0, 2)), False)
+    x = np.concatenate([fit.panels.ravel(), fit.pose.numbers,
+                        [tilt - share.tilt for tilt, share in zip(fit.tilts, shares, strict=True)
+                         ][1:]])
+    open_shares = [light / light.sum(axis=0) for light in problem.lights(x)]
+    azimuths, found = target.slits.azimuths, []
+    for k in range(len(azimuths)):
+        slits = target.slits.model_copy(update={'azimuths': azimuths[:k] + azimuths[k + 1:]})
+        filled = _Problem(head, target.model_copy(update={'slits': slits}), camera, shares,
+                          np.zeros((0, 2)), False)
+        change = np.concatenate([(light / light.sum(axis=0) - before).ravel() for light, before in
+                                 zip(filled.lights(x), open_shares, strict=True)])
+        residual = np.concatenate([r.ravel() for r in fit.residuals])
+        found.append(residual @ change / (change @ change))
+    return np.array(found)

@@ -1,17 +1,21 @@
 """ps_calibrate: ring calibration from folders of pictures, without a graph."""
 import argparse
+from dataclasses import asdict
 import json
+import math
 from pathlib import Path
 import sys
 
 import numpy as np
 
 from ps_calibration.calibrate import Calibration, calibrate, head_calibration
+from ps_calibration.motor_calibration import MotorCalibration, TiltReading, calibrate_motor
 from ps_calibration.ring_target import default_target_path, load_target
 from ps_head_driver.calibration_file import write_calibration
 from ps_head_driver.errors import PsError
 from ps_head_driver.head_model import DIRECTIONS, HeadModel, load_head, nominal_head_path
-from ps_head_driver.stack_folder import read_stack
+from ps_head_driver.stack import Panel, Stack
+from ps_head_driver.stack_folder import read_lights, read_stack
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -31,7 +35,28 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def as_json(result: Calibration, head: HeadModel, folders: list[Path]) -> dict:
+def motor_of(result: Calibration, head: HeadModel, folders: list[Path],
+             stacks: list[Stack]) -> MotorCalibration | None:
+    """The motor's own calibration; None with fewer than three positions or a failed fit."""
+    if result.fit is None or result.verdict == 'FAILED':
+        return None
+    readings = []
+    for folder, stack, tilt in zip(folders, stacks, result.fit.tilts, strict=True):
+        counts = next(light.motor_counts for light in stack.lights if light.panel == Panel.E)
+        approach = read_lights(folder).approach or 'up'
+        readings.append(TiltReading(counts, tilt, approach))
+    if len({reading.motor_counts for reading in readings}) < 3:
+        return None
+    return calibrate_motor(readings, head)
+
+
+def _numbers(motor: MotorCalibration) -> dict:
+    """Without NaN, which JSON does not know."""
+    return {key: value if math.isfinite(value) else None for key, value in asdict(motor).items()}
+
+
+def as_json(result: Calibration, head: HeadModel, folders: list[Path],
+            motor: MotorCalibration | None = None) -> dict:
     """The result under the names of the documentation; null for what a failure left unknown."""
     fit, homography = result.fit, result.camera_to_plane()
     listed = []
@@ -48,7 +73,7 @@ def as_json(result: Calibration, head: HeadModel, folders: list[Path]) -> dict:
                           'offset': fit.pose.plane.offset},
         'z_scale': result.z_scale if fit else None,
         'camera_to_plane': None if homography is None else homography.tolist(),
-        'timings_s': result.timings_s}
+        'motor': motor and _numbers(motor), 'timings_s': result.timings_s}
 
 
 def main() -> None:
@@ -57,13 +82,18 @@ def main() -> None:
     try:
         head = load_head(arguments.head or nominal_head_path())
         target = load_target(arguments.target or default_target_path())
-        result = calibrate([read_stack(folder)[0] for folder in arguments.folders], target, head)
+        stacks = [read_stack(folder)[0] for folder in arguments.folders]
+        result = calibrate(stacks, target, head)
+        motor = motor_of(result, head, arguments.folders, stacks)
         if arguments.json:
             arguments.json.write_text(
-                json.dumps(as_json(result, head, arguments.folders), indent=2) + '\n')
+                json.dumps(as_json(result, head, arguments.folders, motor), indent=2) + '\n')
         if result.verdict != 'FAILED' and arguments.out:
-            write_calibration(head_calibration(result, head, target, arguments.serial),
-                              arguments.out)
+            calibration = head_calibration(result, head, target, arguments.serial)
+            if motor and motor.backlash_counts > 0:
+                calibration = calibration.model_copy(
+                    update={'backlash_counts': round(motor.backlash_counts)})
+            write_calibration(calibration, arguments.out)
     except PsError as error:
         sys.exit(f'ps_calibrate: {error.code.name}: {error.message}')
     except OSError as error:
@@ -76,6 +106,10 @@ def main() -> None:
             x, y, z = panel.center * 1e3
             print(f'panel {name}  at ({x:.2f}, {y:.2f}, {z:.2f}) mm')
     print(f'z scale  {result.z_scale:.4f}')
+    if motor:
+        print(f'motor    offset {motor.offset_counts:.0f} counts, scale {motor.scale:.5f}, '
+              f'backlash {motor.backlash_counts:.0f} counts, '
+              f'repeats to {motor.repeatability_counts:.0f} counts')
 
 
 if __name__ == '__main__':

@@ -266,15 +266,16 @@ def _judge(fit: RingFit, free: RingFit, target: RingTarget, blocked: NDArray) ->
                           'check the target file')
     if abs(height - 1) > _Z_SCALE and _rms(free) < max(0.8 * rms, _POOR_RMS):
         return ('FAILED' if rms > _FAILED_RMS else 'POOR'), (
-            f'the wall seems to be {height:.3f} times as high as the target file says; check '
-            'that it is the right target and the file')
+            f'the wall seems to be {"higher" if height > 1 else "lower"} than the target file '
+            f'says (fitted {1e3 * free.height:.2f} mm); is it the right target and file?')
     if rms > _FAILED_RMS:
         return 'FAILED', (f'the shadows do not fit this target (residual {rms:.3f}); is it '
                           'another ring than the target file says, or damaged?')
     beyond = abs(fit.panels) > _LIMIT * _UNLIKELY
     if beyond.any():
         name = DIRECTIONS[int(np.argmax(beyond.any(axis=1)))]
-        return 'FAILED', f'panel {name} would be far out of its place; check its mounting'
+        return 'FAILED', (f'panel {name} would be far out of its place; is it another ring than '
+                          'the target file says? if not, check the mounting of the panel')
     if rms > _POOR_RMS:
         return 'POOR', (f'the shadows fit badly (residual {rms:.3f}); clean the target and keep '
                         'other light away')

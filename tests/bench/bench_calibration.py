@@ -59,6 +59,21 @@ def accuracy(nominal: HeadModel, target: RingTarget, seeds: range, scale: float,
     row('time, s', seconds, None, '10')
 
 
+def positions(nominal: HeadModel, target: RingTarget, scale: float) -> None:
+    """Print what two motor positions, fitted together, find for the second one's tilt."""
+    kinematics, bench = BrightFieldKinematics(nominal), random_bench(nominal, 3)
+    counts = [kinematics.motor_counts(math.radians(degrees)) for degrees in (20, 30)]
+    start = time.perf_counter()
+    result = calibrate([render_stack(bench, nominal, solid_of(target), m, scale) for m in counts],
+                       target, nominal)
+    seconds = time.perf_counter() - start
+    print(f'two positions: {result.verdict} {result.reason}')
+    if result.fit is not None:
+        error = result.fit.tilts[1] - float(kinematics.tilt(counts[1]))
+        print(f'tilt of the second against the first: {math.degrees(error):.4f} deg off, '
+              f'{seconds:.1f} s with rendering')
+
+
 def repeatability(nominal: HeadModel, target: RingTarget, repeats: int, scale: float,
                   tilt: float) -> None:
     """Print the scatter of the light directions over pictures that differ by their noise."""
@@ -129,7 +144,8 @@ def confusion(nominal: HeadModel, target: RingTarget, scale: float, tilt: float)
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--only', choices=('accuracy', 'repeatability', 'confusion'))
+    parser.add_argument('--only',
+                        choices=('accuracy', 'positions', 'repeatability', 'confusion'))
     parser.add_argument('--heads', type=int, default=10)
     parser.add_argument('--first', type=int, default=1, help='seed of the first head')
     parser.add_argument('--scale', type=float, default=0.5, help='of the pictures')
@@ -143,6 +159,8 @@ def main() -> None:
     if arguments.only in (None, 'accuracy'):
         seeds = range(arguments.first, arguments.first + arguments.heads)
         accuracy(nominal, target, seeds, scale, tilt)
+    if arguments.only in (None, 'positions'):
+        positions(nominal, target, scale)
     if arguments.only in (None, 'repeatability'):
         repeatability(nominal, target, 10, scale, tilt)
     if arguments.only in (None, 'confusion'):

@@ -1,22 +1,26 @@
 """The whole calibration on rendered pictures, and what it refuses."""
 from collections.abc import Callable
+from dataclasses import replace
 import json
+import math
 import sys
 
 import numpy as np
 from numpy.typing import NDArray
 import pytest
 
-from ps_calibration.calibrate import calibrate
+from ps_calibration.calibrate import _common_camera, _light_only, _nominal_tilt, calibrate
 from ps_calibration.cli import ps_calibrate
 from ps_calibration.ring_target import RingTarget
-from ps_calibration.synthetic import Bench, errors_of, with_images
+from ps_calibration.synthetic import Bench, errors_of, render_stack, solid_of, with_images
 from ps_head_driver.calibration_file import apply, read_calibration
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import HeadModel
 from ps_head_driver.kinematics import BrightFieldKinematics
 from ps_head_driver.stack import Plane, Stack
 from ps_head_driver.stack_folder import write_stack
+
+SCALE, TILT = 0.4, math.radians(30)     # of the stack of conftest.py
 
 
 def test_command_calibrates_a_random_head(
@@ -82,6 +86,26 @@ def test_spoilt_pictures_never_pass(
     result = calibrate([with_images(stack, spoil(stack.images))], target, nominal)
     assert result.verdict == 'FAILED'
     assert reason in result.reason
+
+
+def test_a_blocked_slit_is_named(
+        stack: Stack, bench: Bench, target: RingTarget, nominal: HeadModel) -> None:
+    slits = target.slits.azimuths
+    pictures = render_stack(bench, nominal, solid_of(target, slits=slits[:2] + slits[3:]),
+                            stack.lights[0].motor_counts, SCALE)
+    result = calibrate([pictures], target, nominal)
+    assert result.verdict == 'FAILED'
+    assert 'slit at 90 degrees' in result.reason
+
+
+def test_twelve_bit_pictures_without_camera_and_counts_are_understood(
+        stack: Stack, nominal: HeadModel) -> None:
+    bare = Stack(images=[image.astype(np.uint16) * 16 for image in stack.images],
+                 lights=[replace(light, motor_counts=0) for light in stack.lights])
+    captures = _light_only(bare)
+    assert max(image.max() for image in captures) > 1000
+    assert _common_camera([bare], nominal).width_px == stack.shape[1]
+    assert _nominal_tilt(bare, BrightFieldKinematics(nominal)) == pytest.approx(TILT, abs=1e-3)
 
 
 def test_missing_frames_are_named(

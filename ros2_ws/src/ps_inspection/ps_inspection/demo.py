@@ -23,11 +23,11 @@ from ps_head_driver.frames import optical_to_plane
 from ps_head_driver.head_model import load_head, nominal_head_path
 from ps_head_driver.stack import Geometry, Stack, angular_error_deg
 from ps_inspection.cell_client import CellClient
-from ps_inspection.html_report import data_uri, png_bytes, render_page, shrink
 from ps_inspection.runner import Cell
 from ps_inspection.session_reader import Session
 from ps_interfaces import msg as ps
 from ps_interfaces import srv
+from ps_reconstruction.html_report import data_uri, png_bytes, render_page, shrink
 from ps_reconstruction.integration import remove_plane
 from ps_reconstruction.preview import height_view, normal_preview, slope_preview
 
@@ -209,7 +209,7 @@ def _write(
 
     report = options.out / 'report.html'
     source = str(options.input_folder or f'rendered scene: {options.scene}')
-    render_page('demo.html', report, title='Photometric stereo inspection',
+    render_page('ps_inspection', 'demo.html', report, title='Photometric stereo inspection',
                 subtitle=f'{source}; stack {info.stack_id}', pictures=entries, frames=frames,
                 tables=_tables(result))
     result.files['report'] = str(report)

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 import pytest
 
-from ps_calibration.calibrate import _common_camera, _light_only, _nominal_tilt, calibrate
+from ps_calibration.calibrate import calibrate
 from ps_calibration.cli import ps_calibrate
+from ps_calibration.ring_pictures import common_camera, light_only, nominal_tilt
 from ps_calibration.ring_target import RingTarget
 from ps_calibration.synthetic import Bench, errors_of, render_stack, solid_of, with_images
 from ps_head_driver.calibration_file import apply, read_calibration
@@ -102,10 +103,10 @@ def test_twelve_bit_pictures_without_camera_and_counts_are_understood(
         stack: Stack, nominal: HeadModel) -> None:
     bare = Stack(images=[image.astype(np.uint16) * 16 for image in stack.images],
                  lights=[replace(light, motor_counts=0) for light in stack.lights])
-    captures = _light_only(bare)
+    captures = light_only(bare)
     assert max(image.max() for image in captures) > 1000
-    assert _common_camera([bare], nominal).width_px == stack.shape[1]
-    assert _nominal_tilt(bare, BrightFieldKinematics(nominal)) == pytest.approx(TILT, abs=1e-3)
+    assert common_camera([bare], nominal).width_px == stack.shape[1]
+    assert nominal_tilt(bare, BrightFieldKinematics(nominal)) == pytest.approx(TILT, abs=1e-3)
 
 
 def test_missing_frames_are_named(

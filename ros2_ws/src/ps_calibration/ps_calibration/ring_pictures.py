@@ -1,0 +1,123 @@
+"""Pictures of the half ring before any fit: are they usable, and where is the target in them?"""
+from collections.abc import Sequence
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ps_calibration.detection import find_dots
+from ps_calibration.ring_fit import Shares
+from ps_calibration.ring_target import RingTarget
+from ps_calibration.target_pose import TargetPose, fit_pose
+from ps_head_driver.camera_model import scaled_camera
+from ps_head_driver.errors import ErrorCode, PsError
+from ps_head_driver.head_model import DIRECTIONS, CameraGeometry, HeadModel
+from ps_head_driver.kinematics import BrightFieldKinematics
+from ps_head_driver.stack import Mode, Panel, Stack
+
+_SATURATED = 0.002       # part of the pixels at the end of the range
+_DARK = 0.05             # mean of a picture, relative to the end of its range
+_DEAD = 0.3              # of the mean of the four panels
+_MOVED_PX = 0.3          # of a dot, between two pictures
+
+
+def common_camera(stacks: Sequence[Stack], head: HeadModel) -> CameraGeometry:
+    """Intrinsics of the pictures; where they state none, those of the head."""
+    if not stacks:
+        raise PsError(ErrorCode.CALIBRATION_BAD_REQUEST, 'no pictures given')
+    cameras = [stack.camera or scaled_camera(head.camera, *reversed(stack.shape))
+               for stack in stacks]
+    for k, camera in enumerate(cameras):
+        if camera != cameras[0]:
+            raise PsError(ErrorCode.CALIBRATION_BAD_REQUEST,
+                          f'position {k + 1}: another camera or picture size than position 1; '
+                          'calibrate with one camera (lights.yaml: camera)')
+    return cameras[0]
+
+
+def nominal_tilt(stack: Stack, kinematics: BrightFieldKinematics) -> float:
+    """From the motor counts; where the pictures state none, from the lights' own axes, rad."""
+    light = next(light for light in stack.lights
+                 if light.panel == Panel.E and light.mode == Mode.BRIGHT_FIELD)
+    if light.motor_counts:
+        return float(kinematics.tilt(light.motor_counts))
+    return math.acos(min(max(-light.axis[2], -1.0), 1.0))
+
+
+def _range_of(images: Sequence[NDArray]) -> float:
+    """End of the grey values' range; cameras deliver 10, 12 or 14 bit in words of 16."""
+    if not np.issubdtype(images[0].dtype, np.integer):
+        return math.inf
+    if images[0].dtype == np.uint8:
+        return 255.0
+    highest = max(int(image.max()) for image in images)
+    return float(next(2**bits - 1 for bits in (10, 12, 14, 16) if highest < 2**bits))
+
+
+def _frame(stack: Stack, panel: Panel) -> tuple[NDArray, float]:
+    """One frame and its exposure."""
+    for image, light in zip(stack.images, stack.lights, strict=True):
+        if light.panel == panel and light.mode == Mode.BRIGHT_FIELD:
+            return image, light.exposure_scale
+    if panel == Panel.NONE and stack.ambient is not None:
+        return stack.ambient, 1.0
+    raise PsError(ErrorCode.CALIBRATION_BAD_REQUEST,
+                  f'{stack.stack_id or "the pictures"}: frame {panel.name} is missing; a ring '
+                  'calibration needs E, N, W, S, ALL and NONE')
+
+
+def light_only(stack: Stack) -> list[NDArray]:
+    """E, N, W, S at equal exposure, without the light of the room.
+
+    :raises PsError: CALIBRATION_CAPTURE_FAILED for pictures that cannot be used.
+    """
+    code, name = ErrorCode.CALIBRATION_CAPTURE_FAILED, stack.stack_id or 'pictures'
+    dark, dark_scale = _frame(stack, Panel.NONE)
+    full = _range_of(stack.images)
+    frames = []
+    for panel in (Panel.E, Panel.N, Panel.W, Panel.S, Panel.ALL):
+        image, scale = _frame(stack, panel)
+        if np.mean(image >= full) > _SATURATED:
+            raise PsError(code, f'{name}: frame {panel.name} is saturated; lower its exposure')
+        # the room shines for as long as the shutter is open
+        grey = image.astype(np.float32) / scale - dark.astype(np.float32) / dark_scale
+        frames.append(grey.mean(axis=-1) if grey.ndim == 3 else grey)
+    singles, together = frames[:4], frames[4]
+    means = np.array([float(frame.mean()) for frame in singles])
+    if math.isfinite(full) and means.max() < _DARK * full:
+        raise PsError(code, f'{name}: the pictures are too dark; raise the exposure')
+    for panel_name, mean in zip(DIRECTIONS, means, strict=True):
+        if mean < _DEAD * means.mean():
+            raise PsError(code, f'{name}: panel {panel_name} gives no light, or its picture was '
+                                'taken without it; check its cable and LEDs')
+    if abs(together.mean() / means.sum() - 1) > 0.05:
+        raise PsError(code, f'{name}: the picture with all panels on is not the sum of the '
+                            'single ones; check exposure_scale and the panels')
+    return [*singles, together]
+
+
+def locate(captures: Sequence[Sequence[NDArray]], target: RingTarget,
+           camera: CameraGeometry) -> tuple[NDArray, TargetPose]:
+    """Dots in the mean of all pictures, and the pose; refuses pictures that moved."""
+    found = np.array([[find_dots(picture, target, camera) for picture in capture]
+                      for capture in captures])
+    moved = np.linalg.norm(found - np.median(found, axis=(0, 1)), axis=-1).max(axis=-1)
+    position, frame = np.unravel_index(moved.argmax(), moved.shape)
+    if moved.max() > _MOVED_PX:
+        raise PsError(ErrorCode.CALIBRATION_CAPTURE_FAILED,
+                      f'position {position + 1}: the target moved by {moved.max():.1f} px in '
+                      f'frame {[*DIRECTIONS, "ALL"][frame]}; keep head and target still')
+    total = np.sum([np.sum(capture[:4], axis=0) for capture in captures], axis=0)
+    dots_px = find_dots(total, target, camera)
+    return dots_px, fit_pose(dots_px, target, camera)
+
+
+def require_labels(measured: Shares, predicted: NDArray) -> None:
+    """Refuse pictures whose panel is another one than they say."""
+    likeness = np.corrcoef(measured.values, predicted)[:4, 4:]
+    for i, best in enumerate(likeness.argmax(axis=1)):
+        if best != i:
+            raise PsError(ErrorCode.CALIBRATION_CAPTURE_FAILED,
+                          f'the picture of panel {DIRECTIONS[i]} shows the light of panel '
+                          f'{DIRECTIONS[best]}; check the cables of the panels and how the '
+                          'camera is turned')

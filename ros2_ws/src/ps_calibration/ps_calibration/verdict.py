@@ -1,0 +1,52 @@
+"""When to believe a fit, and what to tell who has to mend what is wrong."""
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ps_calibration.ring_fit import RingFit
+from ps_calibration.ring_target import RingTarget
+from ps_head_driver.head_model import DIRECTIONS
+
+_FAILED_RMS, _POOR_RMS = 0.02, 0.006     # of the shares of light
+_UNLIKELY = 1.7          # corrections, relative to the tolerances they were given
+_Z_SCALE = 0.03          # of the wall's height, before the target is doubted
+_NO_WALL = 0.4           # of the wall's height, below which there is none
+_BLOCKED = 0.5           # of a slit
+_LIMIT = np.array([0.006, 0.006, 0.006, 0.07, 0.07, 0.25])
+
+
+def _rms(fit: RingFit) -> float:
+    return max(float(np.sqrt(np.mean(r**2))) for r in fit.residuals)
+
+
+def judge(fit: RingFit, free: RingFit, target: RingTarget, blocked: NDArray) -> tuple[str, str]:
+    """The most specific reason that the fits give.
+
+    :param free: the fit with a free height of the wall.
+    :param blocked: of each slit, see blocked_slits.
+    """
+    rms, height = _rms(fit), free.height / target.height
+    if height < _NO_WALL:
+        return 'FAILED', ('no shadows of the wall are seen; is the half ring missing from its '
+                          'plate, or a lower one?')
+    if blocked.max() > _BLOCKED and rms < _FAILED_RMS:
+        azimuth = math.degrees(target.slits.azimuths[int(blocked.argmax())])
+        return 'FAILED', (f'the slit at {azimuth:.0f} degrees lets no light through; clean it, or '
+                          'check the target file')
+    if abs(height - 1) > _Z_SCALE and _rms(free) < max(0.8 * rms, _POOR_RMS):
+        return ('FAILED' if rms > _FAILED_RMS else 'POOR'), (
+            f'the wall seems to be {"higher" if height > 1 else "lower"} than the target file '
+            f'says (fitted {1e3 * free.height:.2f} mm); is it the right target and file?')
+    if rms > _FAILED_RMS:
+        return 'FAILED', (f'the shadows do not fit this target (residual {rms:.3f}); is it '
+                          'another ring than the target file says, or damaged?')
+    beyond = abs(fit.panels) > _LIMIT * _UNLIKELY
+    if beyond.any():
+        name = DIRECTIONS[int(np.argmax(beyond.any(axis=1)))]
+        return 'FAILED', (f'panel {name} would be far out of its place; is it another ring than '
+                          'the target file says? if not, check the mounting of the panel')
+    if rms > _POOR_RMS:
+        return 'POOR', (f'the shadows fit badly (residual {rms:.3f}); clean the target and keep '
+                        'other light away')
+    return 'OK', ''

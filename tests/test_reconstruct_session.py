@@ -15,11 +15,11 @@ from ps_head_driver.fake.renderer import make_renderer
 from ps_head_driver.head_model import load_head, nominal_head_path
 from ps_head_driver.kinematics import BrightFieldKinematics, lights_at
 from ps_head_driver.stack import Stack
-from ps_inspection.session_format import STACK_TYPE, Topic
 from ps_inspection.session_writer import SessionWriter, WriterOptions
 from ps_reconstruction.cli.ps_reconstruct import main
 from ps_reconstruction.pipeline import reconstruct
-from ps_reconstruction.session_input import read_session, session_file
+from ps_reconstruction.session_format import STACK_TYPE, Topic
+from ps_reconstruction.session_reader import Scan, Session
 
 
 @pytest.fixture(scope='module')
@@ -57,12 +57,14 @@ def test_a_cut_off_session_is_good_up_to_there(
 ) -> None:
     # large enough for several chunks of the file
     large = replace(stack, images=[np.tile(image, (8, 8)) for image in stack.images])
-    file = session_file(record(large, tmp_path / 'session', 4))
-    assert file is not None
-    assert len(list(read_session(file))) == 4
+    session = Session(record(large, tmp_path / 'session', 4))
+    assert len(list(session.stacks())) == 4
+    file = session.file
     whole = file.read_bytes()
     file.write_bytes(whole[:int(len(whole) * 0.8)])
-    assert 1 <= len(list(read_session(file))) < 4
+    scan = Scan()
+    assert 1 <= len(list(session.stacks(scan))) < 4
+    assert 'ends inside a record' in scan.problems[0]
     file.write_bytes(b'not a session')
     assert main([str(file.parent), '--out', str(tmp_path / 'bad')]) == 1
     assert len(capsys.readouterr().err.strip().splitlines()) == 1

@@ -27,9 +27,10 @@ from ps_head_driver.ros_support import LATCHED, RELIABLE
 from ps_head_driver.stack import Light, Panel, Stack
 from ps_inspection.graph import NODES
 from ps_inspection.runner import Cell
-from ps_inspection.session_reader import Scan, Session
+from ps_inspection.session_recovery import recover
 from ps_interfaces.msg import AcquisitionDone, HeadCalibration, PhotometricStack
 from ps_interfaces.srv import StartSession, StopSession
+from ps_reconstruction.session_reader import Scan, Session
 
 pytestmark = pytest.mark.graph
 RECORDER = [node for node in NODES if node.executable == 'session_recorder']
@@ -198,7 +199,7 @@ def test_killed_recorder_loses_no_acknowledged_stack(peer: Peer) -> None:
     peer.until(lambda: len(peer.recorded) >= 4)
     os.kill(peer.cell.processes[0].process.pid, signal.SIGKILL)
     peer.cell.processes[0].process.wait()
-    result = Session(peer.folder / 'killed').recover()
+    result = recover(Session(peer.folder / 'killed'))
     assert result.changed
     found = [stack.stack_id for stack in Session(peer.folder / 'killed').stacks()]
     assert found[:len(peer.recorded)] == peer.recorded

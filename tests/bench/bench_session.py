@@ -15,8 +15,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from ps_inspection.session_format import Topic
 from ps_inspection.session_writer import SessionWriter, WriterOptions
+from ps_reconstruction.session_format import Topic
 
 STACK = Topic('/ps_head/stack', 'ps_interfaces/msg/PhotometricStack', definition='string data\n')
 STACK_BYTES = {'4 x 1280x1024 mono8': 4 * 1280 * 1024, '4 x 2448x2048 mono8': 4 * 2448 * 2048}

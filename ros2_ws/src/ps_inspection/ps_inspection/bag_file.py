@@ -9,7 +9,7 @@ from mcap.writer import CompressionType, Writer
 import yaml
 
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_inspection.session_format import (
+from ps_reconstruction.session_format import (
     METADATA_FILE,
     Topic,
     error_of,

@@ -24,12 +24,12 @@ from ps_head_driver.head_model import load_head, nominal_head_path
 from ps_head_driver.stack import Geometry, Stack, angular_error_deg
 from ps_inspection.cell_client import CellClient
 from ps_inspection.runner import Cell
-from ps_inspection.session_reader import Session
 from ps_interfaces import msg as ps
 from ps_interfaces import srv
 from ps_reconstruction.html_report import data_uri, png_bytes, render_page, shrink
 from ps_reconstruction.integration import remove_plane
 from ps_reconstruction.preview import height_view, normal_preview, slope_preview
+from ps_reconstruction.session_reader import Session
 
 OUTPUTS = ('slope', 'normal', 'albedo', 'height', 'shape', 'confidence')
 

@@ -14,8 +14,8 @@ from ps_head_driver.conversions import message_to_stack
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.stack import Stack
 from ps_head_driver.stack_folder import write_stack
-from ps_inspection.session_reader import Scan, Session
 from ps_reconstruction.pipeline import Options, Reconstruction, reconstruct
+from ps_reconstruction.session_reader import Scan, Session
 
 INDEX_FIELDS = (
     'folder', 'stack_id', 'part_id', 'session_id', 'stamp_ns', 'calibration_id', 'geometry',

@@ -9,8 +9,8 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_inspection.session_format import TOPICS, Topic
-from ps_inspection.session_reader import Message, Scan, Session
+from ps_reconstruction.session_format import TOPICS, Topic
+from ps_reconstruction.session_reader import Message, Scan, Session
 
 # what live nodes would say about the played stacks themselves
 DERIVED = ('ps_interfaces/msg/ReconstructionInfo', 'diagnostic_msgs/msg/DiagnosticArray')

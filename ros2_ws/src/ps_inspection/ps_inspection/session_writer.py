@@ -13,7 +13,7 @@ import time
 
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_inspection.bag_file import BagFile, create_bag
-from ps_inspection.session_format import Topic, error_of
+from ps_reconstruction.session_format import Topic, error_of
 
 
 @dataclass(frozen=True)

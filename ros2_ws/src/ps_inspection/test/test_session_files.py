@@ -19,9 +19,10 @@ import yaml
 
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_inspection import bag_file
-from ps_inspection.session_format import Topic, check_name, stack_id_of
-from ps_inspection.session_reader import Scan, Session
+from ps_inspection.session_recovery import recover
 from ps_inspection.session_writer import SessionWriter, WriterOptions
+from ps_reconstruction.session_format import Topic, check_name, stack_id_of
+from ps_reconstruction.session_reader import Scan, Session
 
 BIG = Topic('/ps_head/big', 'std_msgs/msg/String', definition='string data\n', type_hash=(
     'RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18'))
@@ -115,12 +116,12 @@ def test_cut_anywhere_recovers_what_was_flushed_before(tmp_path: Path, cut: floa
     (folder / 'cut_0.mcap').write_bytes(data[:size])
 
     before = list(Session(folder).messages())
-    result = Session(folder).recover()
+    result = recover(Session(folder))
     assert result.messages == len(before)
     assert result.changed
     assert list(Session(folder).messages()) == before
     assert Session(folder).info().complete
-    assert not Session(folder).recover().changed
+    assert not recover(Session(folder)).changed
     assert sorted(p.name for p in folder.iterdir()) == ['cut_0.mcap', 'metadata.yaml']
 
 
@@ -135,7 +136,7 @@ def test_damage_in_the_middle_costs_one_chunk(tmp_path: Path) -> None:
     kept = [m.data[8:9] for m in Session(tmp_path / 's').messages(scan) if m.topic == BIG]
     assert kept == [b'A', b'B', b'D']
     assert len(scan.problems) == 1
-    result = Session(tmp_path / 's').recover()
+    result = recover(Session(tmp_path / 's'))
     assert result.changed
     assert Session(tmp_path / 's').info().scan.problems == []
 
@@ -145,7 +146,7 @@ def test_missing_metadata_is_made_again(tmp_path: Path) -> None:
     metadata = tmp_path / 's' / 'metadata.yaml'
     original = metadata.read_text()
     metadata.unlink()
-    assert Session(tmp_path / 's').recover().changed
+    assert recover(Session(tmp_path / 's')).changed
     assert metadata.read_text() == original
 
 
@@ -191,7 +192,7 @@ def kill_and_recover(folder: Path, chance: random.Random) -> tuple[set[bytes], i
         process.stdout.close()
     # a line cut off by the kill is no acknowledgement
     acknowledged = set((first + rest).rpartition(b'\n')[0].split())
-    result = Session(folder).recover()
+    result = recover(Session(folder))
     assert result.changed
     found = {m.data[8:].split(b'.')[0] for m in Session(folder).messages() if m.topic == BIG}
     return acknowledged - found, len(acknowledged), len(found)
@@ -253,7 +254,7 @@ def test_full_disk_leaves_what_was_acknowledged_readable(tmp_path: Path, monkeyp
         assert not info.complete
         assert info.counts[BIG.name] == len(written) > 0
         with pytest.raises(PsError, match='disk is full'):
-            Session(disk / 's').recover()
+            recover(Session(disk / 's'))
         assert Session(disk / 's').info().counts == info.counts
     finally:
         subprocess.run(['umount', str(disk)], check=True)
@@ -369,7 +370,7 @@ def test_links_left_in_a_session_do_not_lead_out_of_it(tmp_path: Path) -> None:
         (folder / name).symlink_to(outside)
     file = folder / 's_0.mcap'
     file.write_bytes(file.read_bytes()[:-20])
-    Session(folder).recover()
+    recover(Session(folder))
     assert outside.read_text() == 'mine'
     assert Session(folder).info().complete
 

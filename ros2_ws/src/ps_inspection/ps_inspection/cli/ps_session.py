@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 from ps_head_driver.errors import PsError
-from ps_inspection.session_format import STACK_TYPE
-from ps_inspection.session_reader import Session
+from ps_inspection.session_recovery import recover
+from ps_reconstruction.session_reader import Session
 
 Report = dict[str, Any]
 
@@ -102,12 +102,12 @@ def _info(options: argparse.Namespace, console: Console) -> Report:
     return {
         'file': str(info.path), 'complete': info.complete, 'size_bytes': info.size_bytes,
         'start_ns': info.start, 'end_ns': info.end, 'messages': info.counts,
-        'stacks': sum(n for t, n in info.counts.items() if info.types[t] == STACK_TYPE),
+        'stacks': info.stacks,
         'metadata': info.scan.metadata, 'problems': info.scan.problems}
 
 
 def _recover(options: argparse.Namespace, console: Console) -> Report:
-    result = Session(options.session).recover()
+    result = recover(Session(options.session))
     for problem in result.problems:
         console.print(f'damage: {problem}', style='yellow', markup=False)
     console.print(f'{"recovered" if result.changed else "nothing to do"}: {result.messages} '

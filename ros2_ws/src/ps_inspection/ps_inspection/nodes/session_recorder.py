@@ -24,7 +24,10 @@ from ps_head_driver import ros_support
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.ros_support import Parameter
 from ps_inspection.graph import NODES
-from ps_inspection.session_format import (
+from ps_inspection.session_writer import SessionWriter, WriterOptions
+from ps_interfaces.msg import AcquisitionDone
+from ps_interfaces.srv import StartSession, StopSession
+from ps_reconstruction.session_format import (
     STACK_TYPE,
     TOPICS,
     Topic,
@@ -32,9 +35,6 @@ from ps_inspection.session_format import (
     message_definition,
     stack_id_of,
 )
-from ps_inspection.session_writer import SessionWriter, WriterOptions
-from ps_interfaces.msg import AcquisitionDone
-from ps_interfaces.srv import StartSession, StopSession
 
 PARAMETERS = [
     Parameter('session_folder', '', 'Sessions are folders in this one; empty: the environment '

@@ -17,7 +17,7 @@ from ps_head_driver.stack import Stack, Truth, angular_error_deg
 from ps_head_driver.stack_folder import read_stack
 from ps_reconstruction import preview
 from ps_reconstruction.pipeline import METHODS, OUTPUTS, Options, Reconstruction, reconstruct
-from ps_reconstruction.session_input import read_session, session_file
+from ps_reconstruction.session_reader import Scan, Session, is_session
 
 ARRAYS = ('normal', 'slope', 'albedo', 'height', 'shape', 'confidence', 'mask')
 
@@ -74,8 +74,7 @@ def _inputs(options: argparse.Namespace) -> Iterator[tuple[Stack, Truth | None, 
     if not 1 <= options.slant <= 85:
         raise PsError(ErrorCode.RECONSTRUCTION_BAD_PARAMETER,
                       f'--slant: {options.slant:g} is outside 1 to 85 degrees')
-    session = session_file(options.input)
-    if session is None:
+    if not is_session(options.input):
         stack, truth = read_stack(options.input, lights=options.lights, flat=options.flat,
                                   slant=float(np.radians(options.slant)))
         yield stack, truth, options.out
@@ -83,8 +82,20 @@ def _inputs(options: argparse.Namespace) -> Iterator[tuple[Stack, Truth | None, 
     if options.lights != 'all' or options.flat is not None:
         raise PsError(ErrorCode.RECONSTRUCTION_BAD_PARAMETER,
                       '--lights and --flat are for picture folders; a recorded stack carries both')
-    for number, stack in enumerate(read_session(session)):
-        yield stack, None, options.out / f'{number:06d}'
+    yield from _recorded(options)
+
+
+def _recorded(options: argparse.Namespace) -> Iterator[tuple[Stack, Truth | None, Path]]:
+    """Stacks of a session; what a crash cut off is left out."""
+    # needs ROS, which picture folders do not
+    from ps_head_driver.conversions import message_to_stack
+    scan, number = Scan(), -1
+    for number, message in enumerate(Session(options.input).stacks(scan)):
+        yield message_to_stack(message), None, options.out / f'{number:06d}'
+    for problem in scan.problems:
+        print(f'ps_reconstruct: {options.input}: {problem}', file=sys.stderr)
+    if number < 0:
+        raise PsError(ErrorCode.SESSION_NOT_A_SESSION, f'{options.input}: holds no stack')
 
 
 def _process(stack: Stack, truth: Truth | None, out: Path, options: argparse.Namespace,

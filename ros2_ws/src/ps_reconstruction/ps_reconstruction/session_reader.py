@@ -2,11 +2,13 @@
 
 A file is read from front to back, record by record, and nothing it says is trusted: sizes are
 checked against what is there before memory is taken for them, and damage costs the damaged chunk
-only. Nothing here needs ROS except ``Session.stacks``.
+only. Nothing here needs ROS except the decoding of messages.
 """
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from importlib import import_module
 from io import BytesIO
+from itertools import islice
 from pathlib import Path
 import struct
 from typing import Any, BinaryIO
@@ -16,24 +18,29 @@ import lz4.frame
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.stream_reader import breakup_chunk
 import yaml
 import zstandard
 
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_inspection.bag_file import BagFile
-from ps_inspection.session_format import (
+from ps_reconstruction import cdr
+from ps_reconstruction.session_format import (
     METADATA_FILE,
     STACK_TYPE,
     Topic,
-    error_of,
     message_definition,
-    rosbag2_metadata,
-    write_atomically,
 )
 
 MAGIC = b'\x89MCAP0\r\n'
-MAX_CHUNK_BYTES = 2 << 30
+MAX_CHUNK_BYTES = 1 << 30       # the largest stack that is read
+MAX_QOS_CHARACTERS = 10_000
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where in a file a message is: byte of its record or chunk, and number in the chunk."""
+
+    offset: int
+    number: int
 
 
 @dataclass(frozen=True)
@@ -44,6 +51,7 @@ class Message:
     data: bytes
     log_time: int
     publish_time: int
+    place: Place = field(compare=False)
 
 
 @dataclass
@@ -77,16 +85,10 @@ class Info:
     types: dict[str, str]
     scan: Scan
 
-
-@dataclass(frozen=True)
-class Recovery:
-    """What ``Session.recover`` did."""
-
-    changed: bool
-    messages: int
-    stacks: int
-    lost_bytes: int
-    problems: list[str]
+    @property
+    def stacks(self) -> int:
+        """Photometric stacks on all topics."""
+        return sum(n for topic, n in self.counts.items() if self.types[topic] == STACK_TYPE)
 
 
 class Session:
@@ -99,8 +101,8 @@ class Session:
         path = Path(path)
         self.max_chunk_bytes = max_chunk_bytes
         # metadata.yaml also names the file, but could name any file
-        self._is_folder = path.is_dir()
-        files = sorted(path.glob('*.mcap')) if self._is_folder else [path]
+        self.is_folder = path.is_dir()
+        files = sorted(path.glob('*.mcap')) if self.is_folder else [path]
         if not path.exists():
             raise PsError(ErrorCode.SESSION_NOT_A_SESSION, f'{path} does not exist')
         if len(files) != 1:
@@ -125,7 +127,7 @@ class Session:
         scan = Scan() if scan is None else scan
         schemas: dict[int, records.Schema] = {}
         topics: dict[int, Topic] = {}
-        for record in self._records(scan):
+        for record, place in self._records(scan):
             if isinstance(record, records.Schema):
                 schemas[record.id] = record
             elif isinstance(record, records.Channel):
@@ -142,7 +144,26 @@ class Session:
                 scan.metadata[record.name] = dict(record.metadata)
             elif isinstance(record, records.Message) and record.channel_id in topics:
                 yield Message(topics[record.channel_id], record.data, record.log_time,
-                              record.publish_time)
+                              record.publish_time, place)
+
+    def read(self, place: Place) -> bytes:
+        """Serialized message at a place that ``messages`` told, without reading what is before.
+
+        :raises PsError: SESSION_NOT_A_SESSION if there is none.
+        """
+        try:
+            with self.file.open('rb') as stream:
+                stream.seek(place.offset)
+                opcode, length = _record_head(stream)
+                record = next(islice(self._parse(opcode, stream, length, Scan()),
+                                     place.number, None))
+            if isinstance(record, records.Message):
+                return record.data
+            reason = 'not a message'
+        except Exception as error:
+            reason = f'{type(error).__name__}: {error}'
+        raise PsError(ErrorCode.SESSION_NOT_A_SESSION,
+                      f'{self.file} has changed: no message at byte {place.offset}: {reason}')
 
     def stacks(self, scan: Scan | None = None) -> Iterator[Any]:
         """All photometric stacks as ps_interfaces messages.
@@ -150,23 +171,34 @@ class Session:
         :raises PsError: SESSION_NOT_A_SESSION if the session was recorded with another definition
             of the stack; a single stack that cannot be decoded is a problem of the scan.
         """
-        from rclpy.serialization import deserialize_message
-
-        from ps_interfaces.msg import PhotometricStack
-
         scan = Scan() if scan is None else scan
-        _, expected = message_definition(STACK_TYPE)
-        for number, message in enumerate(
-                m for m in self.messages(scan) if m.topic.type == STACK_TYPE):
-            if message.topic.type_hash not in ('', expected):
-                raise PsError(
-                    ErrorCode.SESSION_NOT_A_SESSION,
-                    f'{self.file} was recorded with another definition of {STACK_TYPE}; read it '
-                    'with the software version that "ps_session info" shows')
+        for number, message in enumerate(self.stack_messages(scan)):
             try:
-                yield deserialize_message(message.data, PhotometricStack)
-            except Exception as error:
+                yield decode(message.data, STACK_TYPE)
+            except ValueError as error:
                 scan.problems.append(f'stack {number} cannot be decoded: {error}')
+
+    def stack_messages(self, scan: Scan | None = None) -> Iterator[Message]:
+        """All photometric stacks, serialized.
+
+        :raises PsError: as ``stacks``.
+        """
+        for message in self.messages(scan):
+            if message.topic.type == STACK_TYPE:
+                self.check_definition(message.topic)
+                yield message
+
+    def check_definition(self, topic: Topic) -> None:
+        """Refuse a topic whose messages this software would decode wrongly.
+
+        :raises PsError: SESSION_NOT_A_SESSION if its type had another definition.
+        """
+        _, expected = message_definition(topic.type)
+        if topic.type_hash not in ('', expected):
+            raise PsError(
+                ErrorCode.SESSION_NOT_A_SESSION,
+                f'{self.file} was recorded with another definition of {topic.type}; read it '
+                'with the software version that "ps_session info" shows')
 
     def info(self) -> Info:
         """Read the whole file and say what is in it."""
@@ -182,89 +214,57 @@ class Session:
                     {topic.name: counts.get(topic.name, 0) for topic in scan.topics},
                     {topic.name: topic.type for topic in scan.topics}, scan)
 
-    def recover(self) -> Recovery:
-        """Make a session that was cut off a complete one, losing nothing that can be read.
-
-        The file is written anew beside the old one and put in its place at the end, so an
-        interrupted recovery does no harm. A session that is whole is left alone.
-
-        :raises PsError: SESSION_DISK_FULL, SESSION_NO_PERMISSION or SESSION_WRITE_FAILED;
-            SESSION_BAD_REQUEST for a file without its folder.
-        """
-        if not self._is_folder:
-            raise PsError(ErrorCode.SESSION_BAD_REQUEST,
-                          f'{self.file} is a file; name the session folder it is in')
-        info = self.info()
-        scan = info.scan
-        stacks = sum(n for name, n in info.counts.items() if info.types[name] == STACK_TYPE)
-        result = Recovery(not info.complete or bool(scan.problems), sum(info.counts.values()),
-                          stacks, scan.lost_bytes, scan.problems)
-        custom = scan.metadata.get('session', {})
-        try:
-            if scan.complete and not scan.problems:
-                if result.changed:      # only metadata.yaml is missing
-                    write_atomically(self.folder / METADATA_FILE, rosbag2_metadata(
-                        self.file.name,
-                        [(topic, info.counts[topic.name]) for topic in scan.topics],
-                        info.start, info.end, custom))
-                return result
-            self._rewrite(scan, custom)
-        except OSError as error:
-            raise error_of(error, self.file) from error
-        return result
-
-    def _rewrite(self, scan: Scan, custom: dict[str, str]) -> None:
-        new = self.file.with_name(self.file.name + '.recovering')
-        new.unlink(missing_ok=True)
-        bag = BagFile(new, scan.topics, scan.compression)
-        try:
-            for name, values in scan.metadata.items():
-                bag.add_metadata(name, values)
-            for message in self.messages():
-                bag.write(message.topic.name, message.data, message.log_time,
-                          message.publish_time)
-            bag.finish(custom, self.file)
-        except BaseException:
-            bag.abandon()
-            new.unlink(missing_ok=True)
-            raise
-
     # ------------------------------------------------------------------ records
 
-    def _records(self, scan: Scan) -> Iterator[records.McapRecord]:
-        """Records of interest, those inside chunks included."""
+    def _records(self, scan: Scan) -> Iterator[tuple[records.McapRecord, Place]]:
+        """Records of interest, those inside chunks included, and where they are."""
         size = self.file.stat().st_size
         with self.file.open('rb') as stream:
             stream.seek(len(MAGIC))
             while not scan.complete:
                 start = stream.tell()
-                head = stream.read(9)
-                opcode, length = struct.unpack('<BQ', head) if len(head) == 9 else (0, 0)
+                opcode, length = _record_head(stream)
                 if not opcode or length > size - stream.tell():
                     scan.lost_bytes += size - start
                     scan.problems.append(f'the file ends inside a record, at byte {start}')
                     return
                 if opcode == Opcode.FOOTER:
                     scan.complete = True
-                elif opcode in _READERS:
-                    try:
-                        yield from self._parse(opcode, stream, length, scan)
-                    except Exception as error:      # a damaged record can fail in any way
-                        scan.lost_bytes += length + 9
-                        scan.problems.append(
-                            f'record at byte {start} is damaged: {type(error).__name__}: {error}')
+                try:
+                    for number, record in enumerate(self._parse(opcode, stream, length, scan)):
+                        yield record, Place(start, number)
+                except Exception as error:      # a damaged record can fail in any way
+                    scan.lost_bytes += length + 9
+                    scan.problems.append(
+                        f'record at byte {start} is damaged: {type(error).__name__}: {error}')
                 stream.seek(start + 9 + length)
 
     def _parse(self, opcode: int, stream: BinaryIO, length: int,
-               scan: Scan) -> list[records.McapRecord]:
-        data = ReadDataStream(BytesIO(stream.read(length)))
-        record = _READERS[opcode](data, length)
-        if not isinstance(record, records.Chunk):
-            return [record]
-        scan.compression = record.compression or 'none'
-        return breakup_chunk(self._decompressed(record))
+               scan: Scan) -> Iterator[records.McapRecord]:
+        """The record of interest that follows in the stream, or all those in a chunk."""
+        if opcode != Opcode.CHUNK and opcode not in _READERS:
+            return
+        if length > self.max_chunk_bytes:
+            raise ValueError(f'it has {length} bytes, the limit is {self.max_chunk_bytes}')
+        content = BytesIO(stream.read(length))
+        if opcode != Opcode.CHUNK:
+            yield _READERS[opcode](ReadDataStream(content), length)
+            return
+        chunk = records.Chunk.read(ReadDataStream(content))
+        scan.compression = chunk.compression or 'none'
+        content = BytesIO(self._decompressed(chunk))
+        while True:
+            opcode, length = _record_head(content)
+            if not opcode:
+                return
+            following = content.tell() + length
+            if following > chunk.uncompressed_size:
+                raise ValueError('the chunk ends inside a record')
+            if opcode in _READERS:
+                yield _READERS[opcode](ReadDataStream(content), length)
+            content.seek(following)
 
-    def _decompressed(self, chunk: records.Chunk) -> records.Chunk:
+    def _decompressed(self, chunk: records.Chunk) -> bytes:
         size = chunk.uncompressed_size
         if size > self.max_chunk_bytes:
             raise ValueError(f'chunk claims {size} bytes, the limit is {self.max_chunk_bytes}')
@@ -281,12 +281,17 @@ class Session:
         if len(data) != size or (chunk.uncompressed_crc and
                                  zlib.crc32(data) != chunk.uncompressed_crc):
             raise ValueError('chunk content does not match its size or check sum')
-        chunk.compression, chunk.data = '', data
-        return chunk
+        return data
+
+
+def _record_head(stream: BinaryIO) -> tuple[int, int]:
+    """Opcode and length of content of the next record; opcode 0 at the end."""
+    head = stream.read(9)
+    opcode, length = struct.unpack('<BQ', head) if len(head) == 9 else (0, 0)
+    return opcode, length
 
 
 _READERS: dict[int, Callable[[ReadDataStream, int], records.McapRecord]] = {
-    Opcode.CHUNK: lambda data, _: records.Chunk.read(data),
     Opcode.SCHEMA: lambda data, _: records.Schema.read(data),
     Opcode.CHANNEL: lambda data, _: records.Channel.read(data),
     Opcode.METADATA: lambda data, _: records.Metadata.read(data),
@@ -301,9 +306,30 @@ def _topic(channel: records.Channel, schema: records.Schema) -> Topic:
 
 
 def _is_latched(channel: records.Channel) -> bool:
+    text = channel.metadata.get('offered_qos_profiles', '')
     try:
-        profiles = yaml.safe_load(channel.metadata.get('offered_qos_profiles', ''))
+        profiles = yaml.safe_load(text) if len(text) < MAX_QOS_CHARACTERS else None
         # rosbag2 wrote numbers before version 9
         return bool(profiles) and profiles[0].get('durability') in ('transient_local', 1)
-    except (yaml.YAMLError, AttributeError, KeyError, TypeError):
+    except Exception:       # a foreign text can fail in any way, deep nesting with RecursionError
         return False
+
+
+def decode(data: bytes, message_type: str) -> Any:
+    """Message of an installed type, from serialized data that nobody vouches for.
+
+    :raises ValueError: if it cannot be decoded.
+    """
+    from rclpy.serialization import deserialize_message
+    cdr.check(data, message_type)
+    package, _, name = message_type.split('/')
+    try:
+        return deserialize_message(data, getattr(import_module(f'{package}.msg'), name))
+    except Exception as error:
+        raise ValueError(f'{type(error).__name__}: {error}') from error
+
+
+def is_session(path: Path) -> bool:
+    """Whether a path looks like a session: an .mcap file, or a folder with one."""
+    return (path.is_file() and path.suffix == '.mcap') or (
+        path.is_dir() and any(path.glob('*.mcap')))

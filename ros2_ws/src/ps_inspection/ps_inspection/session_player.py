@@ -1,6 +1,6 @@
 """Playing a session into a running graph, where ros2 bag does not exist."""
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 import time
 
@@ -94,8 +94,7 @@ class Player:
                 continue
             for latched in state.values():
                 # sent now: its own time is over
-                yield Message(latched.topic, latched.data, message.log_time,
-                              latched.publish_time)
+                yield replace(latched, log_time=message.log_time)
             state = {}
             yield message
 

@@ -308,9 +308,9 @@ def _topic(channel: records.Channel, schema: records.Schema) -> Topic:
 def _is_latched(channel: records.Channel) -> bool:
     text = channel.metadata.get('offered_qos_profiles', '')
     try:
-        profiles = yaml.safe_load(text) if len(text) < MAX_QOS_CHARACTERS else None
+        profiles = yaml.safe_load(text if len(text) < MAX_QOS_CHARACTERS else '') or []
         # rosbag2 wrote numbers before version 9
-        return bool(profiles) and profiles[0].get('durability') in ('transient_local', 1)
+        return bool(profiles[0].get('durability') in ('transient_local', 1))
     except Exception:       # a foreign text can fail in any way, deep nesting with RecursionError
         return False
 

@@ -3,7 +3,9 @@ import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from datetime import datetime
+from functools import partial
 import json
+import os
 from pathlib import Path
 import select
 import sys
@@ -53,7 +55,12 @@ def _parser() -> argparse.ArgumentParser:
                 'Reconstruct every stack; run again to go on after an interruption.',
                 'SESSION --out DIR')
     again.add_argument('--out', type=Path, required=True, metavar='DIR')
-    again.add_argument('--method', choices=('ls', 'stv'), default='ls')
+    again.add_argument('--method', choices=('ls', 'stv'), default='',
+                       help='in place of the recorded one')
+    again.add_argument('--workers', type=_count, default=len(os.sched_getaffinity(0)), metavar='N',
+                       help='processes on this machine (default: one for each core)')
+    again.add_argument('--scheduler', default='', metavar='ADDRESS',
+                       help='of a Dask cluster whose workers do it, such as tcp://10.0.0.5:8786')
     return parser
 
 
@@ -79,6 +86,13 @@ def _positive(text: str) -> float:
     value = float(text)
     if not 0 < value < float('inf'):
         raise argparse.ArgumentTypeError('must be positive')
+    return value
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if not 1 <= value <= 1024:
+        raise argparse.ArgumentTypeError('must be from 1 to 1024')
     return value
 
 
@@ -153,15 +167,16 @@ def _play(options: argparse.Namespace, console: Console) -> Report:
 
 def _export(options: argparse.Namespace, console: Console) -> Report:
     from ps_inspection.session_export import export_session
-    return _said(asdict(export_session(Session(options.session), options.out, console.print)),
+    return _said(asdict(export_session(Session(options.session), options.out,
+                                 partial(console.print, markup=False))),
                  options.out, console)
 
 
 def _reconstruct(options: argparse.Namespace, console: Console) -> Report:
-    from ps_inspection.session_export import reconstruct_session
-    from ps_reconstruction.pipeline import Options
-    outcome = reconstruct_session(Session(options.session), options.out,
-                                  Options(method=options.method), console.print)
+    from ps_inspection.session_reconstruct import Workers, reconstruct_session
+    outcome = reconstruct_session(
+        Session(options.session), options.out, options.method,
+        Workers(options.workers, options.scheduler), partial(console.print, markup=False))
     return _said(asdict(outcome), options.out, console)
 
 

@@ -23,6 +23,7 @@ from ps_head_driver.frames import optical_to_plane
 from ps_head_driver.head_model import load_head, nominal_head_path
 from ps_head_driver.stack import Geometry, Stack, angular_error_deg
 from ps_inspection.cell_client import CellClient
+from ps_inspection.height_view import colours, relief, script
 from ps_inspection.runner import Cell
 from ps_interfaces import msg as ps
 from ps_interfaces import srv
@@ -186,8 +187,8 @@ def _write(
 ) -> None:
     stack = message_to_stack(message)
     normal = optical_to_plane(images['normal'])
-    height = height_view(
-        images['height'], _pixel_pitch(stack), metric=stack.geometry is not Geometry.ASSUMED)
+    pitch, metric = _pixel_pitch(stack), stack.geometry is not Geometry.ASSUMED
+    height = height_view(images['height'], pitch, metric=metric)
     pictures = {
         'shape': images['shape'], 'normal': normal_preview(normal),
         'slope': slope_preview(images['slope']), 'height': height,
@@ -207,11 +208,13 @@ def _write(
     frames = [{'name': light.name, 'uri': data_uri(png_bytes(shrink(_to_byte(image), 420)))}
               for light, image in zip(stack.lights, stack.images, strict=True)]
 
+    solid = relief(images['height'], images['shape'], pitch, metric)
     report = options.out / 'report.html'
     source = str(options.input_folder or f'rendered scene: {options.scene}')
     render_page('ps_inspection', 'demo.html', report, title='Photometric stereo inspection',
                 subtitle=f'{source}; stack {info.stack_id}', pictures=entries, frames=frames,
-                tables=_tables(result))
+                tables=_tables(result), reliefs=[{'name': info.part_id, 'stack_id': '', **solid}]
+                if solid else [], colours=colours(), script=script('height_view.js'))
     result.files['report'] = str(report)
     (options.out / 'results.json').write_text(json.dumps(vars(result), indent=2))
 

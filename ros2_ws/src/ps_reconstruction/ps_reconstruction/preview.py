@@ -61,7 +61,7 @@ def height_view(
     :param exaggeration: of the heights; None chooses a round number that shows the relief.
     :param metric: False where the scale is unknown: no units are printed.
     """
-    field, step = _reduced(height, 700)
+    field, step = reduced(height, 700)
     valid = np.isfinite(field)
     if not valid.any():
         return np.full((size[1], size[0], 3), 255, np.uint8)
@@ -79,7 +79,7 @@ def height_view(
     return _annotate(picture, size, scale / oversampling, low, high, exaggeration, metric, title)
 
 
-def _reduced(height: NDArray, most: int) -> tuple[NDArray[np.float64], int]:
+def reduced(height: NDArray, most: int) -> tuple[NDArray[np.float64], int]:
     """Mean over blocks so that the longer side has at most ``most`` cells."""
     step = max(1, -(-max(height.shape) // most))
     rows, columns = (n // step * step for n in height.shape)

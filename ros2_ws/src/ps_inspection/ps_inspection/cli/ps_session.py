@@ -1,4 +1,4 @@
-"""ps_session: look into, play, export, reconstruct and repair recorded sessions."""
+"""ps_session: look into, play, export, reconstruct, report and repair recorded sessions."""
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -24,7 +24,7 @@ Report = dict[str, Any]
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='ps_session', formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Look into, play, export, reconstruct and repair recorded sessions.',
+        description='Look into, play, export, reconstruct, report and repair recorded sessions.',
         epilog='example: ps_session info ~/ps_sessions/session_20260102_030405')
     commands = parser.add_subparsers(dest='command', required=True)
 
@@ -61,6 +61,11 @@ def _parser() -> argparse.ArgumentParser:
                        help='processes on this machine (default: one for each core)')
     again.add_argument('--scheduler', default='', metavar='ADDRESS',
                        help='of a Dask cluster whose workers do it, such as tcp://10.0.0.5:8786')
+    report = add('report', _report, 'Write an HTML page with pictures, figures and faults.',
+                 'SESSION --out report.html')
+    report.add_argument('--out', type=Path, required=True, metavar='FILE')
+    report.add_argument('--pictures', type=_count, default=60, metavar='N',
+                        help='stacks shown with pictures, evenly chosen (default: 60)')
     return parser
 
 
@@ -178,6 +183,17 @@ def _reconstruct(options: argparse.Namespace, console: Console) -> Report:
         Session(options.session), options.out, options.method,
         Workers(options.workers, options.scheduler), partial(console.print, markup=False))
     return _said(asdict(outcome), options.out, console)
+
+
+def _report(options: argparse.Namespace, console: Console) -> Report:
+    from ps_inspection.session_report import write_report
+    outcome = write_report(Session(options.session), options.out, options.pictures,
+                           partial(console.print, markup=False))
+    for problem in outcome.problems:
+        console.print(f'damage: {problem}', style='yellow', markup=False)
+    console.print(f'{options.out}: {outcome.stacks} stacks, {outcome.pictures} with pictures, '
+                  f'{outcome.faults} faults')
+    return asdict(outcome)
 
 
 def _said(report: Report, out: Path, console: Console) -> Report:

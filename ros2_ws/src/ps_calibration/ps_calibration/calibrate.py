@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ps_calibration.ring_fit import (
     RingFit,
+    Shares,
     blocked_slits,
     corrected,
     fit_ring,
@@ -42,6 +43,7 @@ class Calibration:
     :param reason: of a verdict that is not OK, and what to do.
     :param fit: None if it failed before the fit.
     :param z_scale: known height of the wall over the one fitted.
+    :param shares: what was fitted, per motor position.
     """
 
     verdict: str
@@ -50,6 +52,7 @@ class Calibration:
     fit: RingFit | None = None
     z_scale: float = 1.0
     timings_s: dict[str, float] = field(default_factory=dict)
+    shares: list[Shares] = field(default_factory=list)
 
     def panels(self, head: HeadModel) -> list[list[PanelPose]]:
         """Fitted poses of E, N, W, S per motor position, intensities with a mean of 1."""
@@ -100,7 +103,7 @@ def calibrate(stacks: Sequence[Stack], target: RingTarget, head: HeadModel) -> C
     names = list(clock)
     timings = {name: clock[name] - clock[before]
                for before, name in pairwise(names)}
-    return Calibration(verdict, reason, camera, fit, z_scale, timings)
+    return Calibration(verdict, reason, camera, fit, z_scale, timings, shares)
 
 
 def head_calibration(result: Calibration, head: HeadModel, target: RingTarget,

@@ -70,6 +70,10 @@ class RingFit:
     :param scatter: of the residuals relative to the noise expected, robust, at least 1.
     :param deviation: (4, PER_PANEL) standard deviations from the covariance.
     :param pose_deviation: (SIZE,) the same of the pose.
+    :param covariance: (4 PER_PANEL + SIZE,) squared, of all of these, panels first.
+    :param condition: of the fit, largest over smallest singular value, every parameter in units
+        of its deviation if it were the only one; without the four panels' common intensity, which
+        no picture tells.
     """
 
     panels: NDArray
@@ -81,6 +85,8 @@ class RingFit:
     scatter: float
     deviation: NDArray
     pose_deviation: NDArray
+    covariance: NDArray
+    condition: float
 
 
 def corrected(head: HeadModel, panels: NDArray) -> HeadModel:
@@ -312,10 +318,14 @@ def _summary(problem: _Problem, x: NDArray, jacobian: NDArray) -> RingFit:
                        / metres_per_pixel)
         first = last
     panels = x[:4 * PER_PANEL].reshape(4, PER_PANEL).copy()
+    lengths = np.linalg.norm(jacobian, axis=0)
+    strengths = np.linalg.svd(jacobian / np.maximum(lengths, 1e-300), compute_uv=False)
     return RingFit(panels, [problem.tilt(x, k) for k in range(len(lights))], problem.pose(x),
                    problem.height(x), residuals, edge_px, scatter,
                    deviation[:4 * PER_PANEL].reshape(4, PER_PANEL),
-                   deviation[4 * PER_PANEL:problem.first_tilt])
+                   deviation[4 * PER_PANEL:problem.first_tilt],
+                   covariance[:problem.first_tilt, :problem.first_tilt],
+                   float(strengths[0] / strengths[-2]))
 
 
 def predicted_shares(head: HeadModel, target: RingTarget, camera: CameraGeometry,

@@ -12,7 +12,7 @@ from ps_head_driver.camera_model import plane_points
 from ps_head_driver.fake.renderer import Sensor
 from ps_head_driver.fake.ring_renderer import Placement, RingRenderer, RingSolid, placement
 from ps_head_driver.head_model import DIRECTIONS, HeadModel
-from ps_head_driver.kinematics import BrightFieldKinematics, lights_at
+from ps_head_driver.kinematics import BrightFieldKinematics, as_light, lights_at
 from ps_head_driver.light_model import light_vectors
 from ps_head_driver.stack import Light, Panel, Plane, Stack, angular_error_deg
 
@@ -103,9 +103,7 @@ def errors_of(calibrated: HeadModel, plane: Plane, bench: Bench, tilt: float) ->
     for head in (calibrated, bench.head):
         ring = BrightFieldKinematics(head).ring
         poses = [ring.pose(name, tilt) for name in DIRECTIONS]  # type: ignore[arg-type]
-        vectors.append(np.stack([light_vectors(Light(
-            position=tuple(pose.center), axis=tuple(pose.axis), right=tuple(pose.right),
-            size=pose.size, lobe_exponent=pose.lobe_exponent), point) for pose in poses]))
+        vectors.append(np.stack([light_vectors(as_light(pose), point) for pose in poses]))
         gains = np.array([pose.intensity for pose in poses])
         intensities.append(gains / gains.mean())
     level = angular_error_deg(np.array(plane.normal), np.array(truth.normal))

@@ -249,12 +249,19 @@ def lights_at(head: HeadModel, m_counts: int, dark_field_tilt: float) -> list[Li
             (Mode.DARK_FIELD, 'DF', dark.ring, dark_field_tilt)):
         for name in DIRECTIONS:
             pose = ring.pose(name, angle)  # type: ignore[arg-type]
-            lights.append(Light(
-                name=f'{prefix}_{name}', mode=mode, panel=Panel[name],
-                position=_vector(pose.center), axis=_vector(pose.axis), right=_vector(pose.right),
-                size=pose.size, lobe_exponent=pose.lobe_exponent, intensity=pose.intensity,
-                motor_counts=int(m_counts), tilt=angle))
+            lights.append(as_light(pose, name=f'{prefix}_{name}', mode=mode, panel=Panel[name],
+                                   motor_counts=int(m_counts), tilt=angle))
     return lights
+
+
+def as_light(pose: PanelPose, **known: Any) -> Light:
+    """A panel as the light of a frame.
+
+    :param known: what else is known of the frame, fields of Light.
+    """
+    return Light(position=_vector(pose.center), axis=_vector(pose.axis),
+                 right=_vector(pose.right), size=pose.size, lobe_exponent=pose.lobe_exponent,
+                 intensity=pose.intensity, **known)
 
 
 def _vector(array: NDArray) -> tuple[float, float, float]:

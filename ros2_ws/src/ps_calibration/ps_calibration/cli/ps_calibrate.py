@@ -1,6 +1,7 @@
 """ps_calibrate: ring calibration from folders of pictures, without a graph."""
 import argparse
-from dataclasses import asdict
+from collections.abc import Sequence
+from datetime import UTC, datetime
 import json
 import math
 from pathlib import Path
@@ -8,10 +9,13 @@ import sys
 
 import numpy as np
 
+from ps_calibration.before_after import Comparison, Outcome, compare
 from ps_calibration.calibrate import Calibration, calibrate, head_calibration
 from ps_calibration.motor_calibration import MotorCalibration, TiltReading, calibrate_motor
+from ps_calibration.repeatability import Repeatability, repeatability, repeats
+from ps_calibration.report import Evidence, write_report
 from ps_calibration.ring_target import default_target_path, load_target
-from ps_head_driver.calibration_file import write_calibration
+from ps_head_driver.calibration_file import HeadCalibration, write_calibration
 from ps_head_driver.errors import PsError
 from ps_head_driver.head_model import DIRECTIONS, HeadModel, load_head, nominal_head_path
 from ps_head_driver.stack import Panel, Stack
@@ -24,12 +28,18 @@ def _parser() -> argparse.ArgumentParser:
         description='Calibrate the bright-field panels from pictures of the half-ring target. '
                     'Each folder is a stack folder at one motor position with the frames E, N, '
                     'W, S, ALL and NONE.',
-        epilog='example: ps_calibrate pictures/m25000 pictures/m30000 --out calibration.yaml')
+        epilog='example: ps_calibrate pictures/m25000 pictures/m30000 --out calibration.yaml '
+               '--report report.html')
     parser.add_argument('folders', nargs='+', type=Path, metavar='FOLDER')
     parser.add_argument('--target', type=Path, metavar='YAML', help='target file (default: the '
                         'half ring shipped with this package)')
     parser.add_argument('--head', type=Path, metavar='YAML', help='head file (default: nominal)')
     parser.add_argument('--out', type=Path, metavar='YAML', help='calibration file to write')
+    parser.add_argument('--report', type=Path, metavar='HTML', help='report to write, also of a '
+                        'calibration that failed')
+    parser.add_argument('--check', type=Path, action='append', default=[], metavar='FOLDER',
+                        help='pictures of a part, to be reconstructed before and after the '
+                             'calibration for the report; can be given several times')
     parser.add_argument('--serial', default='', help='serial number of the head, for the file')
     parser.add_argument('--json', type=Path, metavar='FILE', help='machine-readable result')
     return parser
@@ -50,13 +60,20 @@ def motor_of(result: Calibration, head: HeadModel, folders: list[Path],
     return calibrate_motor(readings, head)
 
 
-def _numbers(motor: MotorCalibration) -> dict:
+def _numbers(values: dict[str, float]) -> dict[str, float | None]:
     """Without NaN, which JSON does not know."""
-    return {key: value if math.isfinite(value) else None for key, value in asdict(motor).items()}
+    return {key: value if math.isfinite(value) else None for key, value in values.items()}
+
+
+def _figures(outcome: Outcome) -> dict[str, float | None]:
+    return _numbers({'bow_m': outcome.bow, 'lean_deg': outcome.lean_deg,
+                     'bias_deg': outcome.bias_deg, 'worst_deg': outcome.worst_deg,
+                     'height_scale': outcome.height_scale})
 
 
 def as_json(result: Calibration, head: HeadModel, folders: list[Path],
-            motor: MotorCalibration | None = None) -> dict:
+            motor: MotorCalibration | None = None, repeated: Sequence[Repeatability] = (),
+            parts: Sequence[Comparison] = ()) -> dict:
     """The result under the names of the documentation; null for what a failure left unknown."""
     fit, homography = result.fit, result.camera_to_plane()
     listed = []
@@ -73,7 +90,47 @@ def as_json(result: Calibration, head: HeadModel, folders: list[Path],
                           'offset': fit.pose.plane.offset},
         'z_scale': result.z_scale if fit else None,
         'camera_to_plane': None if homography is None else homography.tolist(),
-        'motor': motor and _numbers(motor), 'timings_s': result.timings_s}
+        'condition': fit and fit.condition, 'motor': motor and _numbers(vars(motor)),
+        'repeatability': [
+            {'count': group.count, 'direction_deg': np.degrees(group.direction).tolist(),
+             'intensity': group.intensity.tolist(), 'level_deg': math.degrees(group.level),
+             'z_scale': group.z_scale} for group in repeated],
+        'checks': [
+            {'part': part.name, **{when: {method: _figures(outcome)
+                                          for method, outcome in outcomes.items()}
+                                   for when, outcomes in (('before', part.before),
+                                                          ('after', part.after))}}
+            for part in parts],
+        'timings_s': result.timings_s}
+
+
+def _checked(folders: list[Path], head: HeadModel,
+             calibration: HeadCalibration | None) -> list[Comparison]:
+    """Parts reconstructed before and after."""
+    if calibration is None:
+        return []
+    return [compare(folder.name, *read_stack(folder), head, calibration) for folder in folders]
+
+
+def _print(result: Calibration, head: HeadModel, motor: MotorCalibration | None,
+           repeated: list[Repeatability], parts: list[Comparison]) -> None:
+    print(f'{result.verdict} {result.reason}'.strip())
+    for panels in result.panels(head):
+        for name, panel in zip(DIRECTIONS, panels, strict=True):
+            x, y, z = panel.center * 1e3
+            print(f'panel {name}  at ({x:.2f}, {y:.2f}, {z:.2f}) mm')
+    print(f'z scale  {result.z_scale:.4f}')
+    if motor:
+        print(f'motor    offset {motor.offset_counts:.0f} counts, scale {motor.scale:.5f}, '
+              f'backlash {motor.backlash_counts:.0f} counts, '
+              f'repeats to {motor.repeatability_counts:.0f} counts')
+    for group in repeated:
+        print(f'repeats  {group.count}: light directions to '
+              f'{math.degrees(group.direction.max()):.4f} degrees')
+    for part in parts:
+        before, after = part.before['ls'], part.after['ls']
+        print(f'check    {part.name}: mean normal off by {before.lean_deg:.3f} degrees before, '
+              f'{after.lean_deg:.3f} after')
 
 
 def main() -> None:
@@ -85,31 +142,33 @@ def main() -> None:
         stacks = [read_stack(folder)[0] for folder in arguments.folders]
         result = calibrate(stacks, target, head)
         motor = motor_of(result, head, arguments.folders, stacks)
-        if arguments.json:
-            arguments.json.write_text(
-                json.dumps(as_json(result, head, arguments.folders, motor), indent=2) + '\n')
-        if result.verdict != 'FAILED' and arguments.out:
+        calibration = None
+        if result.verdict != 'FAILED':
             calibration = head_calibration(result, head, target, arguments.serial)
             if motor and motor.backlash_counts > 0:
                 calibration = calibration.model_copy(
                     update={'backlash_counts': round(motor.backlash_counts)})
+        parts = _checked(arguments.check, head, calibration)
+        repeated = [] if calibration is None else [
+            found for group in repeats(stacks)
+            if (found := repeatability(group, target, head)) is not None]
+        if arguments.json:
+            arguments.json.write_text(json.dumps(as_json(
+                result, head, arguments.folders, motor, repeated, parts), indent=2) + '\n')
+        if calibration and arguments.out:
             write_calibration(calibration, arguments.out)
+        if arguments.report:
+            write_report(Evidence(
+                result, stacks, [folder.name for folder in arguments.folders], target, head,
+                calibration.created if calibration else datetime.now(UTC), calibration, motor,
+                repeated, parts, arguments.serial), arguments.report)
     except PsError as error:
         sys.exit(f'ps_calibrate: {error.code.name}: {error.message}')
     except OSError as error:
         sys.exit(f'ps_calibrate: {error.filename}: {error.strerror}')
     if result.verdict == 'FAILED':
         sys.exit(f'ps_calibrate: FAILED: {result.reason}')
-    print(f'{result.verdict} {result.reason}'.strip())
-    for panels in result.panels(head):
-        for name, panel in zip(DIRECTIONS, panels, strict=True):
-            x, y, z = panel.center * 1e3
-            print(f'panel {name}  at ({x:.2f}, {y:.2f}, {z:.2f}) mm')
-    print(f'z scale  {result.z_scale:.4f}')
-    if motor:
-        print(f'motor    offset {motor.offset_counts:.0f} counts, scale {motor.scale:.5f}, '
-              f'backlash {motor.backlash_counts:.0f} counts, '
-              f'repeats to {motor.repeatability_counts:.0f} counts')
+    _print(result, head, motor, repeated, parts)
 
 
 if __name__ == '__main__':

@@ -1,9 +1,10 @@
 """Playing a session into a running graph, where ros2 bag does not exist."""
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 import time
 
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -12,6 +13,7 @@ from ps_head_driver.errors import ErrorCode, PsError
 from ps_reconstruction.session_format import TOPICS, Topic
 from ps_reconstruction.session_reader import Message, Scan, Session
 
+SETTLED = 0.5       # s without a new reader after which all are taken to be there
 # what live nodes would say about the played stacks themselves
 DERIVED = ('ps_interfaces/msg/ReconstructionInfo', 'diagnostic_msgs/msg/DiagnosticArray')
 
@@ -25,7 +27,7 @@ class PlayOptions:
     :param loop: begin again at the end, until interrupted.
     :param everything: also what live nodes derive from the stacks.
     :param namespace: in place of the recorded one; empty: as recorded.
-    :param wait: s that a topic may take to find its first reader before playing begins.
+    :param wait: s at most that the topics are given to find their readers.
     """
 
     rate: float = 1.0
@@ -64,10 +66,10 @@ class Player:
             clock: _Clock | None = None
             before = sent
             for message in self._due(scan):
-                publisher = self._publisher(message.topic, scan)
+                self._advertise([message.topic, *scan.topics], scan)
                 clock = clock or _Clock(message.log_time, self._options.rate)
                 self._sleep_until(clock, message.log_time)
-                publisher.publish(message.data)
+                self._publishers[message.topic.name].publish(message.data)
                 self._on_message(message)
                 sent += 1
             if sent == before:
@@ -98,20 +100,37 @@ class Player:
             state = {}
             yield message
 
-    def _publisher(self, topic: Topic, scan: Scan) -> Publisher:
-        if topic.name not in self._publishers:
+    def _advertise(self, topics: Sequence[Topic], scan: Scan) -> None:
+        """Make the publishers that are missing, and give their readers time to find them."""
+        missing = {topic.name: topic for topic in topics
+                   if topic.type in self._known and topic.name not in self._publishers}
+        for topic in missing.values():
             package, _, name = topic.type.split('/')
-            publisher = self._node.create_publisher(
-                getattr(import_module(f'{package}.msg'), name), self._renamed(topic.name, scan),
-                QoSProfile(
-                    depth=topic.depth, reliability=ReliabilityPolicy.RELIABLE,
-                    durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.latched
-                    else DurabilityPolicy.VOLATILE))
-            self._publishers[topic.name] = publisher
-            deadline = time.monotonic() + self._options.wait
-            while not publisher.get_subscription_count() and time.monotonic() < deadline:
-                time.sleep(0.02)
-        return self._publishers[topic.name]
+            try:
+                self._publishers[topic.name] = self._node.create_publisher(
+                    getattr(import_module(f'{package}.msg'), name),
+                    self._renamed(topic.name, scan),
+                    QoSProfile(
+                        depth=topic.depth, reliability=ReliabilityPolicy.RELIABLE,
+                        durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.latched
+                        else DurabilityPolicy.VOLATILE))
+            except (InvalidTopicNameException, ValueError) as error:
+                raise PsError(ErrorCode.SESSION_BAD_REQUEST,
+                              f'topic {topic.name!r} cannot be played: {error}') from error
+        if missing:
+            self._wait_for_readers([self._publishers[name] for name in missing])
+
+    def _wait_for_readers(self, publishers: Sequence[Publisher]) -> None:
+        """Until their number stands still; the first to be found is not the last."""
+        deadline = time.monotonic() + self._options.wait
+        found, since = 0, time.monotonic()
+        while (now := time.monotonic()) < deadline:
+            count = sum(publisher.get_subscription_count() for publisher in publishers)
+            if count != found:
+                found, since = count, now
+            if found and now - since > SETTLED:
+                return
+            time.sleep(0.02)
 
     def _renamed(self, name: str, scan: Scan) -> str:
         recorded = scan.metadata.get('session', {}).get('namespace', '').rstrip('/') + '/'
@@ -122,8 +141,9 @@ class Player:
     def _sleep_until(self, clock: '_Clock', log_time: int) -> None:
         while True:
             if self._paused():
+                begin = time.monotonic()
                 time.sleep(0.05)
-                clock.shift(0.05)
+                clock.shift(time.monotonic() - begin)
                 continue
             left = clock.left(log_time)
             if left <= 0:
@@ -144,5 +164,3 @@ class _Clock:
         """Seconds until a message is due."""
         due = self._begin + (log_time - self._first) * 1e-9 / self._rate
         return due - time.monotonic()
-
-

@@ -43,7 +43,6 @@ CAPTIONS = {
     'shape': 'Shape-enhanced image: raised bright, sunk dark.',
     'normal': 'Normals: red to the right, green up, blue to the viewer.',
     'slope': 'Slopes: hue is the direction, strength the steepness.',
-    'height': 'Height, seen from the side and lit.',
     'albedo': 'Albedo: what remains when the light is taken out.',
     'confidence': 'Confidence: white where all lights agree.',
     'normal_error': 'Angle to the true normal, from black at 0 to white at 5 degrees.',
@@ -203,8 +202,9 @@ def _write(
         path = options.out / f'{name}.png'
         path.write_bytes(png_bytes(picture))
         result.files[name] = str(path)
-        entries.append({'name': name.replace('_', ' ').capitalize(), 'caption': CAPTIONS[name],
-                        'uri': data_uri(png_bytes(shrink(picture, 900)))})
+        if name != 'height':        # the page has it as a solid that can be turned
+            entries.append({'name': name.replace('_', ' ').capitalize(), 'caption': CAPTIONS[name],
+                            'uri': data_uri(png_bytes(shrink(picture, 900)))})
     frames = [{'name': light.name, 'uri': data_uri(png_bytes(shrink(_to_byte(image), 420)))}
               for light, image in zip(stack.lights, stack.images, strict=True)]
 
@@ -265,7 +265,8 @@ def _tables(result: DemoResult) -> list[dict[str, Any]]:
     tables = [
         {'caption': 'Setting', 'rows': [(k, text(v)) for k, v in result.setting.items()]},
         {'caption': 'Times, first stack after the start', 'rows': [
-            (k, f'{v * 1e3:.1f} ms') for k, v in result.timings_s.items()]}]
+            (k, f'{v * 1e3:.1f} ms' if v < 1 else f'{v:.2f} s')
+            for k, v in result.timings_s.items()]}]
     quality = [('valid pixels', f'{result.valid_fraction:.1%}'),
                ('residual, relative', f'{result.residual_rms:.2%}')]
     if result.error_deg:

@@ -233,16 +233,17 @@ class HeightView {
       context.fillText(`heights × ${+this.exaggeration.toPrecision(3)}`, 16, 24);
     }
     if (this.colouring === 'height') {
-      const top = 34, bottom = Math.max(90, Math.min(height - 60, 190)), x = width - 28;
-      const gradient = context.createLinearGradient(0, bottom, 0, top);
+      const lowest = HeightView.length(this.map.low, metric);
+      const highest = HeightView.length(this.map.high, metric);
+      const right = width - 22 - context.measureText(highest).width, left = right - 84;
+      const gradient = context.createLinearGradient(left, 0, right, 0);
       this.colours.forEach(([r, g, b], i) => gradient.addColorStop(
         i / (this.colours.length - 1), `rgb(${r},${g},${b})`));
-      context.fillStyle = gradient;
-      context.fillRect(x, top, 12, bottom - top);
-      context.fillStyle = getComputedStyle(this.canvas).color;
+      context.fillText(highest, right + 6, 24);
       context.textAlign = 'right';
-      context.fillText(HeightView.length(this.map.high, metric), width - 16, top - 8);
-      context.fillText(HeightView.length(this.map.low, metric), width - 16, bottom + 18);
+      context.fillText(lowest, left - 6, 24);
+      context.fillStyle = gradient;
+      context.fillRect(left, 14, right - left, 11);
     }
     context.setTransform(1, 0, 0, 1, 0, 0);
   }

@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip('ps_interfaces.msg', reason='needs the built workspace (make setup)')
 
 from rclpy.action import ActionClient
+from std_srvs.srv import Trigger
 import yaml
 
 from ps_calibration.graph import NODES as CALIBRATION_NODES
@@ -98,7 +99,7 @@ def calibrate(client: CellClient, at: int | None = None,
                     break
             assert reached.is_set(), getting.result().result.message
             meanwhile(handle)
-        assert done.wait(120)
+        assert done.wait(300)
         return getting.result().result, feedback
     finally:
         actions.destroy()
@@ -151,6 +152,13 @@ def test_calibration_brings_the_lights_closer_to_the_truth(
     assert np.abs(after.intensity).max() < 0.01 < np.abs(before.intensity).max()
     assert after.level_deg < 0.06 < before.level_deg
     assert client.stack(client.capture()).calibration_id == identifier
+
+    page = (folder / 'files' / f'{identifier}.html').read_text()
+    assert identifier in page
+    assert page.count('<figure') == 14      # pictures, shadows, residuals, height of the ring
+    listed = client.call(Trigger, 'ring_calibration/list').message
+    assert f'{identifier}.yaml  OK' in listed
+    assert listed.endswith('(active)')
 
 
 @pytest.mark.parametrize('stage', [STATE.CAPTURING, STATE.FITTING])

@@ -4,8 +4,8 @@ It has the paper's Fig. 2 (ring pictures, separated shadows, height of the ring)
 before and after the calibration) for this head, and the numbers behind them.
 """
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from datetime import datetime
+from dataclasses import dataclass
+from datetime import UTC, datetime
 import hashlib
 import math
 import os
@@ -17,19 +17,19 @@ from numpy.typing import NDArray
 
 from ps_calibration import report_figures as figures
 from ps_calibration.before_after import Comparison
-from ps_calibration.calibrate import Calibration
+from ps_calibration.calibrate import Calibration, head_calibration
 from ps_calibration.motor_calibration import MotorCalibration
-from ps_calibration.repeatability import Repeatability
+from ps_calibration.repeatability import Repeatability, repeatability, repeats
 from ps_calibration.ring_height import height_map, wall_height
 from ps_calibration.ring_pictures import light_only
 from ps_calibration.ring_target import RingTarget
 from ps_calibration.shadow_maps import edge_profile, shadow_maps
 from ps_calibration.uncertainty import light_figures
-from ps_head_driver.calibration_file import HeadCalibration
+from ps_head_driver.calibration_file import HeadCalibration, new_calibration_id
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import DIRECTIONS, HeadModel
 from ps_head_driver.stack import Panel, Stack
-from ps_reconstruction.html_report import data_uri, png_bytes, render_page, shrink
+from ps_reconstruction.html_report import data_uri, page, png_bytes, shrink
 
 _MEANING = {
     'OK': 'The pictures fit the target, and the result can be used.',
@@ -61,14 +61,51 @@ class Evidence:
     repeated: Sequence[Repeatability] = ()
     parts: Sequence[Comparison] = ()
     serial: str = ''
-    sources: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """For files: the calibration's id, or that it failed and when."""
+        if self.calibration is not None:
+            return self.calibration.calibration_id
+        return f'failed-{new_calibration_id(self.serial, self.created)}'
 
 
-def write_report(evidence: Evidence, path: Path) -> None:
-    """Write the report.
+def gather(result: Calibration, stacks: Sequence[Stack], names: Sequence[str], target: RingTarget,
+           head: HeadModel, serial: str = '', motor: MotorCalibration | None = None) -> Evidence:
+    """Make the calibration's file and measure the repeatability, if pictures were repeated.
+
+    :param head: as designed.
+    :returns: without a calibration after a failure.
+    """
+    if result.fit is None or result.verdict == 'FAILED':
+        return Evidence(result, stacks, names, target, head, datetime.now(UTC), serial=serial)
+    calibration = head_calibration(result, head, target, serial)
+    if motor is not None and motor.backlash_counts > 0:
+        calibration = calibration.model_copy(
+            update={'backlash_counts': round(motor.backlash_counts)})
+    repeated = [found for group in repeats(stacks)
+                if (found := repeatability(group, target, head)) is not None]
+    return Evidence(result, stacks, names, target, head, calibration.created, calibration, motor,
+                    repeated, serial=serial)
+
+
+def write_report(text: str, path: Path) -> None:
+    """Write a report, all of it or nothing.
 
     :raises PsError: CALIBRATION_WRITE_FAILED naming the file.
     """
+    part = path.with_name(f'.{path.name}.part')
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text(text, encoding='utf-8')
+        os.replace(part, path)
+    except OSError as error:
+        raise PsError(ErrorCode.CALIBRATION_WRITE_FAILED,
+                      f'{path}: {error.strerror or error}') from error
+
+
+def report(evidence: Evidence) -> str:
+    """The page, to be written or sent."""
     result = evidence.result
     sections: dict[str, Any] = {
         'pictures': [], 'shadows': [], 'residuals': [], 'ring': [], 'parts': [], 'lights': [],
@@ -85,16 +122,9 @@ def write_report(evidence: Evidence, path: Path) -> None:
             sections['parts'] = [_part(part) for part in evidence.parts]
             sections['tables'] = [_quality(evidence), *_repeats(evidence), *_motor(evidence),
                                   _provenance(evidence)]
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(f'.{path.name}.part')
-        render_page('ps_calibration', 'calibration.html', part, verdict=result.verdict,
-                    meaning=_MEANING[result.verdict], reason=result.reason,
-                    subtitle=_subtitle(evidence), **sections)
-        os.replace(part, path)
-    except OSError as error:
-        raise PsError(ErrorCode.CALIBRATION_WRITE_FAILED,
-                      f'{path}: {error.strerror or error}') from error
+    return page('ps_calibration', 'calibration.html', verdict=result.verdict,
+                meaning=_MEANING[result.verdict], reason=result.reason,
+                subtitle=_subtitle(evidence), **sections)
 
 
 def _subtitle(evidence: Evidence) -> str:
@@ -284,5 +314,5 @@ def _provenance(evidence: Evidence) -> dict[str, Any]:
             ('target', f'{evidence.target.name} ({described[:12]})'),
             ('made', f'{evidence.created:%Y-%m-%d %H:%M:%S} UTC'),
             ('software', made.software_version if made else ''),
-            ('pictures', ', '.join(evidence.names)), *evidence.sources.items()]
+            ('pictures', ', '.join(evidence.names))]
     return {'caption': 'Provenance', 'rows': [(name, value) for name, value in rows if value]}

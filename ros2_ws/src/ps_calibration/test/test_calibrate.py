@@ -1,19 +1,19 @@
 """The whole calibration on rendered pictures, and what it refuses."""
-from collections.abc import Callable
 from dataclasses import replace
 import json
 import math
+from pathlib import Path
 import sys
 
 import numpy as np
-from numpy.typing import NDArray
 import pytest
 
 from ps_calibration.calibrate import calibrate
 from ps_calibration.cli import ps_calibrate
 from ps_calibration.ring_pictures import common_camera, light_only, nominal_tilt
 from ps_calibration.ring_target import RingTarget
-from ps_calibration.synthetic import Bench, errors_of, render_stack, solid_of, with_images
+from ps_calibration.synthetic import Bench, errors_of
+from ps_calibration.synthetic_faults import FAULTS, Fault, Rendered
 from ps_head_driver.calibration_file import apply, read_calibration
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import HeadModel
@@ -48,55 +48,52 @@ def test_command_calibrates_a_random_head(
     assert result['z_scale'] == pytest.approx(1, abs=0.03)
 
 
-def _dead(images: list[NDArray]) -> list[NDArray]:
-    return [images[0], images[5], *images[2:]]
+# those that cost no fit; tests/bench/bench_calibration_verdicts.py has the rest
+QUICK = ('target turned over', 'ring with other dots', 'a machined disc instead', 'panel N dead',
+         'panels E and N swapped', 'pictures mirrored', 'frame E saturated', 'all frames dark',
+         'a lamp switched on in frame S', 'frame W moved by 0.5 px')
 
 
-def _swapped(images: list[NDArray]) -> list[NDArray]:
-    return [images[1], images[0], *images[2:]]
-
-
-def _saturated(images: list[NDArray]) -> list[NDArray]:
-    return [np.clip(images[0].astype(int) * 3, 0, 255).astype(np.uint8), *images[1:]]
-
-
-def _dark(images: list[NDArray]) -> list[NDArray]:
-    return [image // 20 for image in images]
-
-
-def _moved(images: list[NDArray]) -> list[NDArray]:
-    return [*images[:3], np.roll(images[3], 2, axis=1), *images[4:]]
-
-
-def _something_else(images: list[NDArray]) -> list[NDArray]:
-    return [*(np.full_like(image, 100) for image in images[:4]),
-            np.full_like(images[4], 100), np.zeros_like(images[5])]
-
-
-@pytest.mark.parametrize(('spoil', 'reason'), [
-    (_dead, 'panel N gives no light'),
-    (_swapped, 'picture of panel E shows the light of panel N'),
-    (_saturated, 'frame E is saturated'),
-    (_dark, 'too dark'),
-    (_moved, 'px in frame S'),
-    (_something_else, 'not found'),
-])
-def test_spoilt_pictures_never_pass(
-        stack: Stack, target: RingTarget, nominal: HeadModel,
-        spoil: Callable[[list[NDArray]], list[NDArray]], reason: str) -> None:
-    result = calibrate([with_images(stack, spoil(stack.images))], target, nominal)
+@pytest.mark.parametrize('fault', [fault for fault in FAULTS if fault.name in QUICK],
+                         ids=lambda fault: fault.name)
+def test_wrong_pictures_never_pass(fault: Fault, stack: Stack, bench: Bench, target: RingTarget,
+                                   nominal: HeadModel) -> None:
+    rendered = Rendered(bench, nominal, target, stack, SCALE)
+    result = calibrate([fault.make(rendered)], target, nominal)
     assert result.verdict == 'FAILED'
-    assert reason in result.reason
+    assert any(word in result.reason for word in fault.words), result.reason
+
+
+def test_quick_faults_are_there() -> None:
+    assert set(QUICK) <= {fault.name for fault in FAULTS}
 
 
 def test_a_blocked_slit_is_named(
         stack: Stack, bench: Bench, target: RingTarget, nominal: HeadModel) -> None:
-    slits = target.slits.azimuths
-    pictures = render_stack(bench, nominal, solid_of(target, slits=slits[:2] + slits[3:]),
-                            stack.lights[0].motor_counts, SCALE)
-    result = calibrate([pictures], target, nominal)
+    (fault,) = (fault for fault in FAULTS if fault.name == 'middle slit blocked')
+    result = calibrate([fault.make(Rendered(bench, nominal, target, stack, SCALE))], target,
+                       nominal)
     assert result.verdict == 'FAILED'
     assert 'slit at 90 degrees' in result.reason
+
+
+def test_a_truncated_picture_fails_and_is_named(
+        stack: Stack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / 'pictures'
+    write_stack(stack, folder)
+    picture = folder / '002.png'
+    picture.write_bytes(picture.read_bytes()[:2000])
+    monkeypatch.setattr(sys, 'argv', [
+        'ps_calibrate', str(folder), '--json', str(tmp_path / 'result.json'),
+        '--report', str(tmp_path / 'report.html'), '--out', str(tmp_path / 'calibration.yaml')])
+    with pytest.raises(SystemExit) as stopped:
+        ps_calibrate.main()
+    assert '002.png' in str(stopped.value)
+    result = json.loads((tmp_path / 'result.json').read_text())
+    assert (result['verdict'], result['folders']) == ('FAILED', [])
+    assert '002.png' in result['reason']
+    assert '002.png' in (tmp_path / 'report.html').read_text()
+    assert not (tmp_path / 'calibration.yaml').exists()
 
 
 def test_twelve_bit_pictures_without_camera_and_counts_are_understood(

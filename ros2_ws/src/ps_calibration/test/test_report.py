@@ -11,7 +11,7 @@ import pytest
 from ps_calibration.before_after import compare
 from ps_calibration.calibrate import Calibration, calibrate, head_calibration
 from ps_calibration.repeatability import scatter
-from ps_calibration.report import Evidence, write_report
+from ps_calibration.report import Evidence, report, write_report
 from ps_calibration.ring_fit import corrected
 from ps_calibration.ring_height import wall_height
 from ps_calibration.ring_pictures import light_only
@@ -101,8 +101,8 @@ def test_report_of_a_good_calibration_shows_everything(
     assert abs(after.height_scale - 1) < 0.005
 
     path = tmp_path / 'made' / 'report.html'
-    write_report(Evidence(result, [stack], ['m30'], target, nominal, calibration.created,
-                          calibration, parts=[part], serial='PS-7'), path)
+    write_report(report(Evidence(result, [stack], ['m30'], target, nominal, calibration.created,
+                                 calibration, parts=[part], serial='PS-7')), path)
     page = path.read_text()
     assert not re.search(r'(?:src|href)="(?!data:)', page), 'not self-contained'
     assert page.count('<figure') == 4 + 4 + 4 + 2 + 4
@@ -113,11 +113,8 @@ def test_report_of_a_good_calibration_shows_everything(
 
 
 def test_report_of_a_failure_says_why_and_shows_the_pictures(
-        stack: Stack, target: RingTarget, nominal: HeadModel, result: Calibration,
-        tmp_path: Path) -> None:
+        stack: Stack, target: RingTarget, nominal: HeadModel, result: Calibration) -> None:
     failed = Calibration('FAILED', 'panel N gives no light; check its cable', result.camera)
-    path = tmp_path / 'report.html'
-    write_report(Evidence(failed, [stack], ['a'], target, nominal, datetime.now(UTC)), path)
-    page = path.read_text()
+    page = report(Evidence(failed, [stack], ['a'], target, nominal, datetime.now(UTC)))
     assert 'Panel N gives no light; check its cable.' in page
     assert page.count('<figure') == 4

@@ -47,8 +47,8 @@ def data_uri(data: bytes, kind: str = 'png') -> str:
     return f'data:image/{kind};base64,' + base64.b64encode(data).decode()
 
 
-def render_page(package: str, template: str, path: Path, **content: Any) -> None:
-    """Fill a template and write the page.
+def page(package: str, template: str, **content: Any) -> str:
+    """Fill a template.
 
     :param package: that has the template in its folder templates; base.html is here.
     """
@@ -56,4 +56,9 @@ def render_page(package: str, template: str, path: Path, **content: Any) -> None
         loader=ChoiceLoader([PackageLoader(package), PackageLoader('ps_reconstruction')]),
         autoescape=select_autoescape(), undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True)
-    path.write_text(environment.get_template(template).render(**content), encoding='utf-8')
+    return environment.get_template(template).render(**content)
+
+
+def render_page(package: str, template: str, path: Path, **content: Any) -> None:
+    """Fill a template, see :func:`page`, and write the page."""
+    path.write_text(page(package, template, **content), encoding='utf-8')

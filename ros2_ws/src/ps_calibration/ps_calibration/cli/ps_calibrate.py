@@ -1,7 +1,6 @@
 """ps_calibrate: ring calibration from folders of pictures, without a graph."""
 import argparse
-from collections.abc import Sequence
-from datetime import UTC, datetime
+from dataclasses import replace
 import json
 import math
 from pathlib import Path
@@ -9,13 +8,13 @@ import sys
 
 import numpy as np
 
-from ps_calibration.before_after import Comparison, Outcome, compare
-from ps_calibration.calibrate import Calibration, calibrate, head_calibration
+from ps_calibration.before_after import Outcome, compare
+from ps_calibration.calibrate import Calibration, calibrate
+from ps_calibration.catalogue import list_calibrations
 from ps_calibration.motor_calibration import MotorCalibration, TiltReading, calibrate_motor
-from ps_calibration.repeatability import Repeatability, repeatability, repeats
-from ps_calibration.report import Evidence, write_report
-from ps_calibration.ring_target import default_target_path, load_target
-from ps_head_driver.calibration_file import HeadCalibration, write_calibration
+from ps_calibration.report import Evidence, gather, report, write_report
+from ps_calibration.ring_target import RingTarget, default_target_path, load_target
+from ps_head_driver.calibration_file import write_calibration
 from ps_head_driver.errors import PsError
 from ps_head_driver.head_model import DIRECTIONS, HeadModel, load_head, nominal_head_path
 from ps_head_driver.stack import Panel, Stack
@@ -30,7 +29,7 @@ def _parser() -> argparse.ArgumentParser:
                     'W, S, ALL and NONE.',
         epilog='example: ps_calibrate pictures/m25000 pictures/m30000 --out calibration.yaml '
                '--report report.html')
-    parser.add_argument('folders', nargs='+', type=Path, metavar='FOLDER')
+    parser.add_argument('folders', nargs='*', type=Path, metavar='FOLDER')
     parser.add_argument('--target', type=Path, metavar='YAML', help='target file (default: the '
                         'half ring shipped with this package)')
     parser.add_argument('--head', type=Path, metavar='YAML', help='head file (default: nominal)')
@@ -40,6 +39,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--check', type=Path, action='append', default=[], metavar='FOLDER',
                         help='pictures of a part, to be reconstructed before and after the '
                              'calibration for the report; can be given several times')
+    parser.add_argument('--list', type=Path, metavar='FOLDER', help='only list the calibration '
+                        'files of a folder, and why some are refused')
     parser.add_argument('--serial', default='', help='serial number of the head, for the file')
     parser.add_argument('--json', type=Path, metavar='FILE', help='machine-readable result')
     return parser
@@ -71,10 +72,9 @@ def _figures(outcome: Outcome) -> dict[str, float | None]:
                      'height_scale': outcome.height_scale})
 
 
-def as_json(result: Calibration, head: HeadModel, folders: list[Path],
-            motor: MotorCalibration | None = None, repeated: Sequence[Repeatability] = (),
-            parts: Sequence[Comparison] = ()) -> dict:
+def as_json(evidence: Evidence, folders: list[Path]) -> dict:
     """The result under the names of the documentation; null for what a failure left unknown."""
+    result, head, motor = evidence.result, evidence.head, evidence.motor
     fit, homography = result.fit, result.camera_to_plane()
     listed = []
     for k, panels in enumerate(result.panels(head)):
@@ -94,28 +94,20 @@ def as_json(result: Calibration, head: HeadModel, folders: list[Path],
         'repeatability': [
             {'count': group.count, 'direction_deg': np.degrees(group.direction).tolist(),
              'intensity': group.intensity.tolist(), 'level_deg': math.degrees(group.level),
-             'z_scale': group.z_scale} for group in repeated],
+             'z_scale': group.z_scale} for group in evidence.repeated],
         'checks': [
             {'part': part.name, **{when: {method: _figures(outcome)
                                           for method, outcome in outcomes.items()}
                                    for when, outcomes in (('before', part.before),
                                                           ('after', part.after))}}
-            for part in parts],
+            for part in evidence.parts],
         'timings_s': result.timings_s}
 
 
-def _checked(folders: list[Path], head: HeadModel,
-             calibration: HeadCalibration | None) -> list[Comparison]:
-    """Parts reconstructed before and after."""
-    if calibration is None:
-        return []
-    return [compare(folder.name, *read_stack(folder), head, calibration) for folder in folders]
-
-
-def _print(result: Calibration, head: HeadModel, motor: MotorCalibration | None,
-           repeated: list[Repeatability], parts: list[Comparison]) -> None:
+def _print(evidence: Evidence) -> None:
+    result, motor = evidence.result, evidence.motor
     print(f'{result.verdict} {result.reason}'.strip())
-    for panels in result.panels(head):
+    for panels in result.panels(evidence.head):
         for name, panel in zip(DIRECTIONS, panels, strict=True):
             x, y, z = panel.center * 1e3
             print(f'panel {name}  at ({x:.2f}, {y:.2f}, {z:.2f}) mm')
@@ -124,51 +116,71 @@ def _print(result: Calibration, head: HeadModel, motor: MotorCalibration | None,
         print(f'motor    offset {motor.offset_counts:.0f} counts, scale {motor.scale:.5f}, '
               f'backlash {motor.backlash_counts:.0f} counts, '
               f'repeats to {motor.repeatability_counts:.0f} counts')
-    for group in repeated:
+    for group in evidence.repeated:
         print(f'repeats  {group.count}: light directions to '
               f'{math.degrees(group.direction.max()):.4f} degrees')
-    for part in parts:
+    for part in evidence.parts:
         before, after = part.before['ls'], part.after['ls']
         print(f'check    {part.name}: mean normal off by {before.lean_deg:.3f} degrees before, '
               f'{after.lean_deg:.3f} after')
 
 
+def calibrate_folders(folders: list[Path], target: RingTarget,
+                head: HeadModel) -> tuple[list[Stack], Calibration]:
+    """Pictures and result; pictures that cannot be read or lack frames are a failure, too."""
+    stacks: list[Stack] = []
+    try:
+        stacks += [read_stack(folder)[0] for folder in folders]
+        return stacks, calibrate(stacks, target, head)
+    except PsError as error:
+        return stacks, Calibration('FAILED', error.message, head.camera)
+
+
+def _list(folder: Path, json_file: Path | None) -> None:
+    entries = list_calibrations(folder)
+    for entry in entries:
+        print(entry.text)
+    if json_file:
+        json_file.write_text(json.dumps([
+            {'file': str(entry.path), 'refused': entry.reason or None,
+             'calibration': entry.calibration and entry.calibration.model_dump(mode='json')}
+            for entry in entries], indent=2) + '\n')
+
+
 def main() -> None:
     """Run the command line."""
-    arguments = _parser().parse_args()
+    parser = _parser()
+    arguments = parser.parse_args()
+    if bool(arguments.folders) == bool(arguments.list):
+        parser.error('give folders of pictures, or --list with a folder of calibrations')
     try:
+        if arguments.list:
+            _list(arguments.list, arguments.json)
+            return
         head = load_head(arguments.head or nominal_head_path())
         target = load_target(arguments.target or default_target_path())
-        stacks = [read_stack(folder)[0] for folder in arguments.folders]
-        result = calibrate(stacks, target, head)
+        stacks, result = calibrate_folders(arguments.folders, target, head)
         motor = motor_of(result, head, arguments.folders, stacks)
-        calibration = None
-        if result.verdict != 'FAILED':
-            calibration = head_calibration(result, head, target, arguments.serial)
-            if motor and motor.backlash_counts > 0:
-                calibration = calibration.model_copy(
-                    update={'backlash_counts': round(motor.backlash_counts)})
-        parts = _checked(arguments.check, head, calibration)
-        repeated = [] if calibration is None else [
-            found for group in repeats(stacks)
-            if (found := repeatability(group, target, head)) is not None]
+        evidence = gather(result, stacks, [folder.name for folder in arguments.folders], target,
+                          head, arguments.serial, motor)
+        if evidence.calibration:
+            evidence = replace(evidence, parts=[
+                compare(folder.name, *read_stack(folder), head, evidence.calibration)
+                for folder in arguments.check])
         if arguments.json:
-            arguments.json.write_text(json.dumps(as_json(
-                result, head, arguments.folders, motor, repeated, parts), indent=2) + '\n')
-        if calibration and arguments.out:
-            write_calibration(calibration, arguments.out)
+            arguments.json.write_text(
+                json.dumps(as_json(evidence, arguments.folders), indent=2) + '\n')
+        if evidence.calibration and arguments.out:
+            write_calibration(evidence.calibration, arguments.out)
         if arguments.report:
-            write_report(Evidence(
-                result, stacks, [folder.name for folder in arguments.folders], target, head,
-                calibration.created if calibration else datetime.now(UTC), calibration, motor,
-                repeated, parts, arguments.serial), arguments.report)
+            write_report(report(evidence), arguments.report)
     except PsError as error:
         sys.exit(f'ps_calibrate: {error.code.name}: {error.message}')
     except OSError as error:
         sys.exit(f'ps_calibrate: {error.filename}: {error.strerror}')
     if result.verdict == 'FAILED':
         sys.exit(f'ps_calibrate: FAILED: {result.reason}')
-    _print(result, head, motor, repeated, parts)
+    _print(evidence)
 
 
 if __name__ == '__main__':

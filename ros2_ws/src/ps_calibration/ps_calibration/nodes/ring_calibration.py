@@ -1,17 +1,20 @@
 """Node ring_calibration: makes, holds, saves and loads the active calibration."""
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 import threading
-from typing import Any
+from typing import Any, TypeVar
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
+from std_srvs.srv import Trigger
 
-from ps_calibration.calibrate import Calibration, calibrate, head_calibration
+from ps_calibration.calibrate import calibrate
+from ps_calibration.catalogue import list_calibrations
 from ps_calibration.nodes.stack_source import StackSource
+from ps_calibration.report import gather, report, write_report
 from ps_calibration.ring_target import RingTarget, default_target_path, load_target
 from ps_calibration.setup_hint import SetupHint, setup_hint
 from ps_head_driver import ros_support
@@ -44,6 +47,7 @@ PARAMETERS = [
 ]
 
 _POLL_S = 0.05
+Outcome = TypeVar('Outcome')
 
 
 class RingCalibration(Node):
@@ -58,7 +62,7 @@ class RingCalibration(Node):
         self.reported_serial = ''
         self.refused = ''      # why the calibration of the start was dropped
         self.head = load_head(self.parameters['head_file'] or nominal_head_path())
-        self._busy = threading.Lock()
+        self._busy, self._computing = threading.Lock(), threading.Lock()
         self._cancelled = threading.Event()
         self._running: ServerGoalHandle | None = None
         self._source = StackSource(self, self._cancelled)
@@ -68,6 +72,7 @@ class RingCalibration(Node):
             ps.HeadStatus, 'head_status', self._on_head_status, ros_support.LATCHED)
         self.create_service(CalibrationFile, '~/save', self._on_save)
         self.create_service(CalibrationFile, '~/load', self._on_load)
+        self.create_service(Trigger, '~/list', self._on_list)
         self._action = ActionServer(
             self, CalibrateRing, 'calibrate_ring', self._on_calibrate,
             callback_group=ReentrantCallbackGroup(),
@@ -125,6 +130,14 @@ class RingCalibration(Node):
         assert self.active is not None
         response.calibration_id = self.active.calibration_id
         return f'{path} is active'
+
+    @answers(ErrorCode.CALIBRATION_INTERNAL)
+    def _on_list(self, _: Trigger.Request, response: Trigger.Response) -> str:
+        active = self.active.calibration_id if self.active else ''
+        return '\n'.join(
+            entry.text + ('  (active)' if entry.calibration is not None
+                          and entry.calibration.calibration_id == active else '')
+            for entry in list_calibrations(self.folder)) or f'{self.folder}: no calibrations'
 
     def _activate(self, path: Path) -> None:
         """Read a file and make it active; what was active before stays if it is refused.
@@ -202,18 +215,25 @@ class RingCalibration(Node):
         stacks = self._take_stacks(goal, radii, target, keep)
         done = len(radii)
         self._feedback(goal, CalibrateRing.Feedback.FITTING, done, len(radii))
-        fitted = self._in_worker(stacks, target)
+        fitted = self._in_worker(lambda: calibrate(stacks, target, self.head))
         result.verdict = getattr(ps.HeadCalibration, f'VERDICT_{fitted.verdict}')
         result.reason = fitted.reason
         if fitted.fit is not None:
             result.residuals_px = [float(edge) for edges in fitted.fit.edge_px for edge in edges]
-        serial = self.parameters['head_serial'] or self.reported_serial
-        calibration = head_calibration(fitted, self.head, target, serial)
         self._feedback(goal, CalibrateRing.Feedback.REPORTING, done, len(radii))
-        path = self.folder / f'{calibration.calibration_id}.yaml'
+        serial = self.parameters['head_serial'] or self.reported_serial
+        evidence = self._in_worker(lambda: gather(
+            fitted, stacks, [f'position_{k + 1}' for k in range(done)], target, self.head, serial))
+        text = self._in_worker(lambda: report(evidence))
+        path = self.folder / f'{evidence.name}.yaml'
+        write_report(text, path.with_suffix('.html'))
+        calibration = evidence.calibration
+        if calibration is None:
+            raise PsError(ErrorCode.CALIBRATION_POOR_FIT,
+                          f'{fitted.reason}; report: {path.with_suffix(".html")}')
         write_calibration(calibration, path)
         result.calibration = calibration_to_message(calibration)
-        result.message = f'{calibration.verdict}, written to {path}'
+        result.message = f'{calibration.verdict}, written to {path}, report beside it'
         if request.apply and calibration.verdict == 'OK':
             self._source.check_cancelled()
             self.active, self.refused = calibration, ''
@@ -253,17 +273,19 @@ class RingCalibration(Node):
                              convergence_radius=float(radius), exposure_time=time)
                 for panel, time in frames]
 
-    def _in_worker(self, stacks: Sequence[Stack], target: RingTarget) -> Calibration:
-        """Fit in a thread of its own: a cancel does not wait for it."""
-        outcome: list[Calibration | Exception] = []
+    def _in_worker(self, compute: Callable[[], Outcome]) -> Outcome:
+        """Compute in a thread of its own: a cancel does not wait for it."""
+        outcome: list[Outcome | Exception] = []
 
         def work() -> None:
             try:
-                outcome.append(calibrate(stacks, target, self.head))
+                # not beside one that a cancel left behind: numba's kernels take one caller
+                with self._computing:
+                    outcome.append(compute())
             except Exception as error:
                 outcome.append(error)
 
-        worker = threading.Thread(target=work, name='ring_fit', daemon=True)
+        worker = threading.Thread(target=work, name='calibration', daemon=True)
         worker.start()
         while worker.is_alive():
             self._source.check_cancelled()

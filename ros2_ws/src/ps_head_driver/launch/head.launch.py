@@ -9,4 +9,4 @@ from ps_head_driver.launch_support import describe
 
 
 def generate_launch_description() -> LaunchDescription:
-    return describe(NODES)
+    return describe(NODES, with_frames=True)

@@ -6,15 +6,16 @@ from typing import Any, TypeVar
 
 from builtin_interfaces.msg import Time
 import cv2
-from geometry_msgs.msg import Point, PoseStamped, Quaternion, Vector3
+from geometry_msgs.msg import Point, PoseStamped, Quaternion, TransformStamped, Vector3
 import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image
 
-from ps_head_driver.calibration_file import HeadCalibration, PanelCorrection, Verdict
+from ps_head_driver.calibration_file import HeadCalibration, PanelCorrection, Verdict, apply
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.frames import OPTICAL_FRAME, PLANE_FRAME
-from ps_head_driver.head_model import CameraGeometry
+from ps_head_driver.head_frames import Transform, static_transforms
+from ps_head_driver.head_model import CameraGeometry, HeadModel
 from ps_head_driver.stack import Geometry, Light, Mode, Panel, Plane, Pose, Stack, Vector
 from ps_interfaces import msg as ps
 
@@ -287,12 +288,29 @@ def message_to_pose(message: PoseStamped) -> Pose:
 
 # ---------------------------------------------------------------------------- calibration
 
-def calibration_to_message(calibration: HeadCalibration | None) -> ps.HeadCalibration:
-    """HeadCalibration to its message; None becomes the empty one (nominal geometry)."""
+def transform_to_message(transform: Transform) -> TransformStamped:
+    """Transform to TransformStamped, without a stamp: it is valid at all times."""
+    message = TransformStamped(child_frame_id=transform.child)
+    message.header.frame_id = transform.parent
+    message.transform.translation = vector_to_message(transform.xyz)
+    x, y, z, w = transform.quaternion()
+    message.transform.rotation = Quaternion(x=x, y=y, z=z, w=w)
+    return message
+
+
+def calibration_to_message(
+    calibration: HeadCalibration | None, head: HeadModel,
+) -> ps.HeadCalibration:
+    """HeadCalibration to its message; None becomes the empty one (nominal geometry).
+
+    :param head: as designed; what it says about the mounting face holds for every calibration.
+    """
     message = ps.HeadCalibration()
     message.header.frame_id = PLANE_FRAME
     message.plane_normal.z = 1.0
     message.z_scale = 1.0
+    message.transforms = [
+        transform_to_message(each) for each in static_transforms(apply(head, calibration))]
     if calibration is None:
         return message
     message.calibration_id = calibration.calibration_id

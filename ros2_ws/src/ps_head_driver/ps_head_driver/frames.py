@@ -7,9 +7,10 @@ Height z(x, y) is along ps_head_plane +z; slopes are p = dz/dx, q = dz/dy in ps_
 import numpy as np
 from numpy.typing import NDArray
 
+LINK_FRAME = 'ps_head_link'
+CAMERA_FRAME = 'ps_head_camera_link'
 OPTICAL_FRAME = 'ps_head_camera_optical_frame'
 PLANE_FRAME = 'ps_head_plane'
-LINK_FRAME = 'ps_head_link'
 
 
 def plane_to_optical(vectors: NDArray) -> NDArray:

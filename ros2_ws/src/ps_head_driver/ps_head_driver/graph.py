@@ -58,6 +58,11 @@ class NodeStart:
     parameter_files: tuple[Path, ...]
     parameters: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def enclave(self) -> str:
+        """Security enclave (SROS2) of the node: its own, so that its rights can be the least."""
+        return f'/{self.namespace}/{self.executable}'.replace('//', '/')
+
 
 HEAD_DRIVER = NodeSpec('ps_head_driver', 'head_driver', ('fake_hardware', 'port', 'head_file'))
 NODES = (

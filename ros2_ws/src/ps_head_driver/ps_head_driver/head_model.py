@@ -36,6 +36,13 @@ class CameraGeometry(_Section):
     camera_standoff: Positive
 
 
+class Mount(_Section):
+    """Pose of ps_head_camera_link in ps_head_link, the mounting face: as ``origin`` in URDF."""
+
+    xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)        # m
+    rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)        # rad, about the fixed x, y, z
+
+
 class Hinge(_Section):
     """Hinge or pivot of the panels in the plane of their azimuth."""
 
@@ -132,6 +139,7 @@ class HeadModel(_Section):
     """Geometry of one head. Immutable: calibration makes a corrected copy."""
 
     name: str
+    mount: Mount = Mount()
     camera: CameraGeometry
     bright_field: BrightField
     dark_field: DarkField

@@ -51,8 +51,8 @@ class PanelRing:
         self._outward, self.right = _turned(twisted)
         hinge = field.hinge if isinstance(field, BrightField) else field.pivot
         shift = np.array([panel.shift for panel in own])
-        self._base = ((hinge.r + shift[:, :1]) * self.radial + shift[:, 1:2] * tangential
-                      + (hinge.z + shift[:, 2:]) * _VERTICAL)
+        self.hinges = ((hinge.r + shift[:, :1]) * self.radial + shift[:, 1:2] * tangential
+                       + (hinge.z + shift[:, 2:]) * _VERTICAL)
         self._along, self._out = ((field.arm.along, field.arm.out)
                                   if isinstance(field, BrightField) else (0.0, 0.0))
 
@@ -66,7 +66,7 @@ class PanelRing:
         sine, cosine = np.sin(angle), np.cos(angle)
         axis = -sine * self._outward - cosine * _VERTICAL
         arm = self._along * (cosine * self._outward - sine * _VERTICAL) + self._out * axis
-        return self._base + arm, axis
+        return self.hinges + arm, axis
 
     def pose(self, direction: Direction, tilt: float) -> PanelPose:
         """Pose of one panel at a nominal tilt, rad."""

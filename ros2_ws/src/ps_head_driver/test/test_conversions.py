@@ -160,11 +160,12 @@ def test_calibration_round_trip():
     from datetime import UTC, datetime
 
     from ps_head_driver.calibration_file import HeadCalibration, PanelCorrection
+    head = load_head(nominal_head_path())
     before = HeadCalibration(
         calibration_id='a', created=datetime(2026, 5, 6, tzinfo=UTC), head_serial='PS-1',
-        camera=load_head(nominal_head_path()).camera, verdict='POOR', verdict_reason='dirt',
+        camera=head.camera, verdict='POOR', verdict_reason='dirt',
         panels={'BF_N': PanelCorrection(shift=(1e-3, 0.0, 0.0), shadow_residual_px=0.2),
                 'DF_E': PanelCorrection()})
-    after = convert.message_to_calibration(convert.calibration_to_message(before))
+    after = convert.message_to_calibration(convert.calibration_to_message(before, head))
     assert after == before
-    assert convert.message_to_calibration(convert.calibration_to_message(None)) is None
+    assert convert.message_to_calibration(convert.calibration_to_message(None, head)) is None

@@ -5,10 +5,13 @@
 """
 from launch import LaunchDescription
 
+from ps_head_driver.graph import config_file
 from ps_head_driver.launch_support import describe
 from ps_inspection.environment import cell_environment
 from ps_inspection.graph import NODES
 
 
 def generate_launch_description() -> LaunchDescription:
-    return describe(NODES, cell_environment())
+    return describe(
+        NODES, cell_environment(), with_frames=True,
+        rviz_config=config_file('ps_inspection', 'ps_head.rviz'))

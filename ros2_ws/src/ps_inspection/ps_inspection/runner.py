@@ -234,7 +234,7 @@ def _spawn(start: NodeStart, folder: Path, environment: Mapping[str, str]) -> No
         files.append(own)
     command = [
         sys.executable, '-m', f'{start.package}.nodes.{start.executable}', '--ros-args',
-        '-r', f'__ns:=/{start.namespace}',
+        '-r', f'__ns:=/{start.namespace}', '--enclave', start.enclave,
         *(word for file in files for word in ('--params-file', str(file)))]
     log = folder / f'{start.executable}.log'
     parent = os.getpid()

@@ -7,7 +7,8 @@ The stand-in knows exactly the signatures that the files rely on, as documented 
 * launch.actions.SetEnvironmentVariable(name, value)
 * launch.actions.OpaqueFunction(*, function): function(context) -> list of actions
 * launch.substitutions.LaunchConfiguration(variable_name).perform(context) -> str
-* launch_ros.actions.Node(*, package, executable, namespace, parameters, output)
+* launch_ros.actions.Node(*, package, executable, namespace, parameters, output, arguments,
+  ros_arguments)
 * launch_ros.parameter_descriptions.ParameterValue(value, *, value_type)
 """
 from dataclasses import dataclass, field
@@ -21,10 +22,12 @@ import pytest
 import yaml
 
 from ps_head_driver.graph import NodeSpec, arguments_of, resolve
+from ps_head_driver.head_model import nominal_head_path
 from ps_inspection.environment import cell_environment
 from ps_inspection.graph import NODES
 
 SOURCE = Path(__file__).resolve().parents[2]
+NOMINAL_URDF = (SOURCE / 'ps_head_driver' / 'urdf' / 'ps_head.urdf').read_text()
 LAUNCH_FILES = {
     'ps_head_driver/launch/head.launch.py': 'ps_head_driver.graph',
     'ps_reconstruction/launch/reconstruction.launch.py': 'ps_reconstruction.graph',
@@ -77,13 +80,16 @@ class ParameterValue:
 
 
 class Node:
-    def __init__(self, *, package: str, executable: str, namespace: str, parameters: list[Any],
-                 output: str) -> None:
+    def __init__(self, *, package: str, executable: str, namespace: str, output: str,
+                 parameters: list[Any] | None = None, arguments: list[str] | None = None,
+                 ros_arguments: list[str] | None = None) -> None:
         assert output == 'screen'
+        parameters = parameters or []
         self.package, self.executable, self.namespace = package, executable, namespace
         self.files = [p for p in parameters if isinstance(p, str)]
         self.values = {name: value.value for p in parameters if isinstance(p, dict)
                        for name, value in p.items()}
+        self.arguments, self.ros_arguments = arguments or [], ros_arguments or []
 
 
 @pytest.fixture
@@ -145,10 +151,12 @@ def test_launch_starts_what_ps_cell_starts(
     nodes = importlib.import_module(module).NODES
     given = with_config(nodes, tmp_path) | extra
     started, environment = execute(describe(file), **given)
+    started = [node for node in started if node.package.startswith('ps_')]
     expected = resolve(nodes, given)
     assert [(n.package, n.executable, n.namespace, n.files, n.values) for n in started] == [
         (e.package, e.executable, e.namespace, [str(f) for f in e.parameter_files], e.parameters)
         for e in expected]
+    assert [n.ros_arguments for n in started] == [['--enclave', e.enclave] for e in expected]
     assert environment == (cell_environment() if 'inspection' in file else {})
 
 
@@ -157,7 +165,30 @@ def test_launch_declares_every_argument(launch_system: None, file: str, module: 
     nodes = importlib.import_module(module).NODES
     declared = [(e.name, e.default_value) for e in describe(file).initial_entities
                 if isinstance(e, DeclareLaunchArgument)]
-    assert declared == [(a.name, a.default) for a in arguments_of(nodes)]
+    more = [('publish_frames', 'true')] if 'head.' in file or 'inspection' in file else []
+    more += [('rviz', 'false')] if 'inspection' in file else []
+    assert declared == [*((a.name, a.default) for a in arguments_of(nodes)), *more]
+
+
+@pytest.mark.parametrize('file', [f for f in LAUNCH_FILES if 'head.' in f or 'inspection' in f])
+def test_frames_follow_the_head_file(launch_system: None, tmp_path: Path, file: str) -> None:
+    head_file = tmp_path / 'longer.yaml'
+    head_file.write_text(nominal_head_path().read_text().replace('0.080', '0.123'))
+    for given, expected in (({}, NOMINAL_URDF), ({'head_file': str(head_file)}, 'xyz="0.123 0 0"')):
+        nodes, _ = execute(describe(file), namespace='left/head', **given)
+        publisher = next(n for n in nodes if n.package == 'robot_state_publisher')
+        assert publisher.namespace == 'left/head'
+        assert expected in publisher.values['robot_description']
+    nodes, _ = execute(describe(file), publish_frames='false')
+    assert all(node.package.startswith('ps_') for node in nodes)
+
+
+def test_rviz_is_started_in_the_namespace_of_the_cell(launch_system: None) -> None:
+    nodes, _ = execute(describe('ps_inspection/launch/inspection.launch.py'), rviz='true')
+    (rviz,) = (node for node in nodes if node.package == 'rviz2')
+    assert rviz.namespace == 'ps_head'
+    assert rviz.arguments[0] == '--display-config'
+    assert Path(rviz.arguments[1]).is_file()
 
 
 def test_arguments_reach_their_nodes(tmp_path: Path) -> None:

@@ -182,7 +182,7 @@ class RingCalibration(Node):
 
     def _on_calibrate(self, goal: ServerGoalHandle) -> CalibrateRing.Result:
         result = CalibrateRing.Result(verdict=ps.HeadCalibration.VERDICT_FAILED)
-        result.calibration = calibration_to_message(None)
+        result.calibration = calibration_to_message(None, self.head)
         try:
             with self._exclusive(goal):
                 self._calibrate(goal, result)
@@ -232,7 +232,7 @@ class RingCalibration(Node):
             raise PsError(ErrorCode.CALIBRATION_POOR_FIT,
                           f'{fitted.reason}; report: {path.with_suffix(".html")}')
         write_calibration(calibration, path)
-        result.calibration = calibration_to_message(calibration)
+        result.calibration = calibration_to_message(calibration, self.head)
         result.message = f'{calibration.verdict}, written to {path}, report beside it'
         if request.apply and calibration.verdict == 'OK':
             self._source.check_cancelled()
@@ -307,7 +307,7 @@ class RingCalibration(Node):
     # ------------------------------------------------------------------ outputs
 
     def _publish(self) -> None:
-        self._publisher.publish(calibration_to_message(self.active))
+        self._publisher.publish(calibration_to_message(self.active, self.head))
 
     def _diagnose(self) -> ros_support.Report:
         if self.refused:

@@ -8,6 +8,7 @@ from rclpy._rclpy_pybind11 import RCLError
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from ps_head_driver import convergence_radius, ros_support, strobe_program
@@ -18,6 +19,7 @@ from ps_head_driver.fake.child import EmulatorChild
 from ps_head_driver.fake.trigger_socket import default_path
 from ps_head_driver.frames import PLANE_FRAME
 from ps_head_driver.head_client import PANEL_NAMES, HeadClient, HeadState, Motion
+from ps_head_driver.head_frames import BRIGHT_FIELD_JOINT, DARK_FIELD_JOINT
 from ps_head_driver.head_model import HeadModel, load_head, nominal_head_path
 from ps_head_driver.head_supervisor import HeadSupervisor, Phase, Settings, Snapshot
 from ps_head_driver.kinematics import BrightFieldKinematics, lights_at
@@ -78,6 +80,7 @@ class HeadDriver(LifecycleNode):
 
         parallel = ReentrantCallbackGroup()
         self._status = self.create_publisher(ps.HeadStatus, 'head_status', ros_support.LATCHED)
+        self._joints = self.create_publisher(JointState, 'joint_states', ros_support.RELIABLE)
         self.create_subscription(
             ps.HeadCalibration, 'calibration', self._on_calibration, ros_support.LATCHED)
         for name, handler in (('home', self._on_home), ('stop', self._on_stop),
@@ -341,6 +344,13 @@ class HeadDriver(LifecycleNode):
         # after a signal the context is gone before this node is closed
         with suppress(RCLError, InvalidHandle):
             self._status.publish(status)
+            known = [(name, angle) for name, angle in (
+                (BRIGHT_FIELD_JOINT, status.tilt), (DARK_FIELD_JOINT, status.dark_field_tilt))
+                if math.isfinite(angle)]
+            if known:
+                joints = JointState(header=status.header)
+                joints.name, joints.position = zip(*known, strict=True)
+                self._joints.publish(joints)
 
     def _log(self, text: str, is_error: bool) -> None:
         """Say what is not routine, once."""

@@ -185,6 +185,7 @@ def test_cancel(client: CellClient, stage: int) -> None:
     ({'convergence_radii': [-0.05]}, ErrorCode.CALIBRATION_BAD_REQUEST, 'positive'),
     ({'convergence_radii': [1000.0]}, ErrorCode.CALIBRATION_CAPTURE_FAILED, 'UNREACHABLE'),
     ({'working_directory': '../x'}, ErrorCode.CALIBRATION_BAD_REQUEST, 'leaves'),
+    ({'target_file': '/etc/passwd'}, ErrorCode.CALIBRATION_BAD_REQUEST, 'leaves'),
 ])
 def test_wrong_goals_are_answered(client: CellClient, goal: dict, code: ErrorCode,
                                   reason: str) -> None:
@@ -194,11 +195,11 @@ def test_wrong_goals_are_answered(client: CellClient, goal: dict, code: ErrorCod
     assert result.reason == result.message
 
 
-def test_another_target_is_not_found(client: CellClient, tmp_path: Path) -> None:
+def test_another_target_is_not_found(client: CellClient, folder: Path) -> None:
     content = yaml.safe_load(default_target_path().read_text())
     content['fiducials']['centres'][5] = [-0.012, -0.009]
     content['fiducials']['centres'][4] = [0.004, -0.017]
-    path = tmp_path / 'other.yaml'
-    path.write_text(yaml.safe_dump(content))
-    result, _ = calibrate(client, target_file=str(path), convergence_radii=[0.06])
+    (folder / 'files').mkdir(exist_ok=True)
+    (folder / 'files' / 'other.yaml').write_text(yaml.safe_dump(content))
+    result, _ = calibrate(client, target_file='other.yaml', convergence_radii=[0.06])
     assert result.error_code == ErrorCode.CALIBRATION_TARGET_NOT_FOUND, result.message

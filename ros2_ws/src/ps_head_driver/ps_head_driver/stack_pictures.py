@@ -1,6 +1,5 @@
 """Pictures of stack folders: read and written losslessly, never from outside of their folder."""
 from collections.abc import Sequence
-import os
 from pathlib import Path
 
 import cv2
@@ -8,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ps_head_driver.errors import ErrorCode, PsError
+from ps_head_driver.paths import leads_out
 
 SUFFIXES = ('.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp')
 # a flat field is smooth: more rows than this only cost memory
@@ -22,13 +22,7 @@ def inside(folder: Path, name: str | Path, field: str = '') -> Path:
     :param field: where the name was read, for the message.
     :raises PsError: RECONSTRUCTION_BAD_STACK.
     """
-    try:
-        # realpath, other than Path.resolve, takes a loop of links without complaint
-        path = Path(os.path.realpath(folder / name))
-        out = Path(name).is_absolute() or not path.is_relative_to(os.path.realpath(folder))
-    except ValueError:      # a zero byte in the name
-        out = True
-    if out:
+    if Path(name).is_absolute() or leads_out(folder, name):
         where = f'{folder}: {field}' if field else str(folder)
         raise PsError(_BAD, f'{where}: {str(name)!r} leaves the folder')
     return folder / name

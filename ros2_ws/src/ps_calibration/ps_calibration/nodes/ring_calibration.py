@@ -22,6 +22,7 @@ from ps_head_driver.calibration_file import HeadCalibration, read_calibration, w
 from ps_head_driver.conversions import calibration_to_message
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import load_head, nominal_head_path
+from ps_head_driver.paths import confined
 from ps_head_driver.ros_support import Parameter, answers
 from ps_head_driver.stack import Panel, Stack
 from ps_head_driver.stack_folder_writer import write_stack
@@ -31,14 +32,15 @@ from ps_interfaces.srv import CalibrationFile
 
 PARAMETERS = [
     Parameter('calibration_folder', '~/.ps_head/calibration',
-              'Folder of calibration files; relative names in requests are in it', read_only=True),
+              'Folder of calibration files: names in requests are in it', read_only=True),
     Parameter('calibration_file', '', 'Calibration made active at start; empty: none, nominal '
               'geometry', read_only=True),
     Parameter('head_serial', '', 'Refuse calibrations of other heads; empty: the serial number '
               'that head_status reports'),
     Parameter('head_file', '', 'Head geometry as designed (YAML); empty: the nominal head',
               read_only=True),
-    Parameter('target_file', '', 'Half-ring target (YAML); empty: the one shipped'),
+    Parameter('target_file', '', 'Half-ring target (YAML); empty: the one shipped',
+              read_only=True),
     Parameter('convergence_radii', [0.05, 0.0685], 'Convergence radii at which a calibration '
               'takes its pictures', 'm'),
     Parameter('exposure', 0.003, 'Exposure of the pictures with one panel', 's', 1e-4, 1.0),
@@ -80,7 +82,8 @@ class RingCalibration(Node):
         ros_support.Diagnostics(self, {'Calibration': self._diagnose},
                                 hardware_id=lambda: self.reported_serial)
         if self.parameters['calibration_file']:
-            self._activate(self._path(self.parameters['calibration_file']))
+            # a parameter is the owner's, other than a request: it may name any file
+            self._activate(self.folder / Path(self.parameters['calibration_file']).expanduser())
         self._publish()
 
     def _on_head_status(self, message: ps.HeadStatus) -> None:
@@ -94,21 +97,12 @@ class RingCalibration(Node):
             self.active, self.refused = None, error.message
             self._publish()
 
-    def _path(self, name: str) -> Path:
-        """File of a request.
+    def _path(self, name: str, field: str = 'file') -> Path:
+        """File that a request names.
 
-        :raises PsError: CALIBRATION_BAD_REQUEST for an empty name or one that climbs out.
+        :raises PsError: CALIBRATION_BAD_REQUEST for an empty name or one outside the folder.
         """
-        if not name:
-            raise PsError(ErrorCode.CALIBRATION_BAD_REQUEST, 'file: empty; give a file name')
-        path = Path(name).expanduser()
-        if path.is_absolute():
-            return path
-        inside = (self.folder / path).resolve()
-        if not inside.is_relative_to(self.folder.resolve()):
-            raise PsError(ErrorCode.CALIBRATION_BAD_REQUEST,
-                          f'file: {name} leaves the calibration folder {self.folder}')
-        return inside
+        return confined(self.folder, name, field, ErrorCode.CALIBRATION_BAD_REQUEST)
 
     @answers(ErrorCode.CALIBRATION_INTERNAL)
     def _on_save(self, request: CalibrationFile.Request,
@@ -205,13 +199,15 @@ class RingCalibration(Node):
         :raises PsError: CALIBRATION_* with the reason, also for a verdict FAILED.
         """
         request = goal.request
-        target = load_target(request.target_file or self.parameters['target_file']
-                             or default_target_path())
+        target = load_target(
+            self._path(request.target_file, 'target_file') if request.target_file
+            else self.parameters['target_file'] or default_target_path())
         radii = list(request.convergence_radii or self.parameters['convergence_radii'])
         if not radii or min(radii) <= 0:
             raise PsError(ErrorCode.CALIBRATION_BAD_REQUEST,
                           f'convergence_radii: {radii} must be positive, at least one')
-        keep = self._path(request.working_directory) if request.working_directory else None
+        keep = (self._path(request.working_directory, 'working_directory')
+                if request.working_directory else None)
         stacks = self._take_stacks(goal, radii, target, keep)
         done = len(radii)
         self._feedback(goal, CalibrateRing.Feedback.FITTING, done, len(radii))
@@ -225,7 +221,8 @@ class RingCalibration(Node):
         evidence = self._in_worker(lambda: gather(
             fitted, stacks, [f'position_{k + 1}' for k in range(done)], target, self.head, serial))
         text = self._in_worker(lambda: report(evidence))
-        path = self.folder / f'{evidence.name}.yaml'
+        # the name has the serial number in it, which came over the network
+        path = self._path(f'{evidence.name}.yaml', 'serial number')
         write_report(text, path.with_suffix('.html'))
         calibration = evidence.calibration
         if calibration is None:

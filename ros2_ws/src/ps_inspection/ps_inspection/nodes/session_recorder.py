@@ -38,7 +38,7 @@ from ps_reconstruction.session_format import (
 
 PARAMETERS = [
     Parameter('session_folder', '', 'Sessions are folders in this one; empty: the environment '
-              'variable PS_SESSION_FOLDER, else ~/ps_sessions'),
+              'variable PS_SESSION_FOLDER, else ~/ps_sessions', read_only=True),
     Parameter('compression', 'none', 'Compression of the file',
               choices=('none', 'lz4', 'zstd')),
     Parameter('queue_bytes', 1 << 30, 'Limit of what waits for the disk; what does not fit is '

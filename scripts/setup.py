@@ -342,7 +342,7 @@ def workspace_stamps(base: str) -> dict[str, str]:
     for package in sorted(source.iterdir()):
         if (package / 'setup.py').is_file():
             described += [package / name for name in ('package.xml', 'setup.cfg', 'setup.py')]
-            for folder in ('config', 'launch', 'resource'):
+            for folder in ('config', 'launch', 'resource', 'urdf'):
                 names += [str(path) for path in sorted((package / folder).glob('*'))]
     return {'interfaces': digest(base, *interfaces), 'python': digest(base, *described, *names)}
 

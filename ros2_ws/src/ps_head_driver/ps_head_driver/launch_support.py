@@ -57,14 +57,15 @@ def describe(
                 ros_arguments=['--enclave', node.enclave])
             for node in starts
         ]
-        namespace = starts[0].namespace or '/'
+        namespace = f'/{starts[0].namespace}'
         if publish_frames:
             actions.append(_state_publisher(namespace, values['head_file']))
         if rviz:
             # relative topic names of the configuration are then those of the cell
             actions.append(Node(
                 package='rviz2', executable='rviz2', namespace=namespace, output='screen',
-                arguments=['--display-config', str(rviz_config)]))
+                arguments=['--display-config', str(rviz_config)],
+                ros_arguments=['--enclave', f'{namespace.rstrip("/")}/viewer']))
         return actions
 
     return LaunchDescription([
@@ -83,4 +84,5 @@ def _state_publisher(namespace: str, head_file: str) -> Node:
     return Node(
         package='robot_state_publisher', executable='robot_state_publisher', namespace=namespace,
         output='screen', parameters=[
-            {'robot_description': ParameterValue(description, value_type=str)}])
+            {'robot_description': ParameterValue(description, value_type=str)}],
+        ros_arguments=['--enclave', f'{namespace.rstrip("/")}/robot_state_publisher'])

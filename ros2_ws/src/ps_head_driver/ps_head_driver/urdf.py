@@ -78,7 +78,8 @@ def _add_head(tree: Xml.Element, head: HeadModel, prefix: str) -> None:
 def _add_ring(tree: Xml.Element, prefix: str, ring_name: str, field: BrightField | DarkField,
               ring: PanelRing, limits: tuple[float, float], arm: tuple[float, float]) -> None:
     """Four hinged panels. At tilt 0 the hinge's x is the panel's width, y points outwards and z
-    down; the joint turns about x."""
+    down; the joint turns about x.
+    """
     master = BRIGHT_FIELD_JOINT if ring_name == 'bf' else DARK_FIELD_JOINT
     width, height = field.panel_size
     for index, name in enumerate(DIRECTIONS):

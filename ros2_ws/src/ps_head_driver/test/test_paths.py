@@ -33,8 +33,8 @@ def test_absolute_name_inside_is_taken(folder):
 
 
 @pytest.mark.parametrize('name', [
-    '', '..', '../secret', 'deep/../../secret', '/etc/passwd', '../files_of_others/x', 'out', 'up/x',
-    'up/secret', 'dangling', 'a\0b', 'fine/../../secret'])
+    '', '..', '../secret', 'deep/../../secret', '/etc/passwd', '../files_of_others/x', 'out',
+    'up/x', 'up/secret', 'dangling', 'a\0b', 'fine/../../secret'])
 def test_names_that_lead_out_are_refused(folder, name):
     with pytest.raises(PsError, match='target_file: ') as error:
         confined(folder, name, 'target_file', ErrorCode.CALIBRATION_BAD_REQUEST)

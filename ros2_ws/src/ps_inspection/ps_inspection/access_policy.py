@@ -4,8 +4,9 @@ The rights are read from a running graph, so they are exactly what the nodes use
 the policy format of SROS2 (version 0.2.0), from which ``ros2 security generate_artifacts`` makes
 keys and permissions. Names are relative to the node's namespace, or private, where they can be.
 """
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
+import time
 from typing import Any
 from xml.etree import ElementTree as Xml
 
@@ -87,6 +88,28 @@ def rights_of(observer: Any, node: str, namespace: str, enclave: str) -> Rights:
         reply=plain(served), request=plain(asked), execute=actions(served), call=actions(asked))
 
 
+def running_rights(observer: Any, nodes: Collection[str], namespace: str = '/ps_head',
+                   settle: float = 3.0, timeout: float = 60.0) -> list[Rights]:
+    """Rights of running nodes, looked at until they have not changed for a while.
+
+    :param settle: s without a change.
+    :param timeout: s until all nodes must be there.
+    :raises TimeoutError: naming the nodes that are not.
+    """
+    before: list[Rights] = []
+    begin = since = time.monotonic()
+    while time.monotonic() - since < settle or len(before) < len(nodes):
+        if time.monotonic() - begin > timeout:
+            raise TimeoutError(f'not in the graph: {set(nodes) - {r.node for r in before}}')
+        now = [rights_of(observer, name, where, enclave) for name, where, enclave
+               in sorted(observer.get_node_names_and_namespaces_with_enclaves())
+               if where == namespace and name in nodes]
+        if now != before:
+            before, since = now, time.monotonic()
+        time.sleep(0.1)
+    return before
+
+
 def _short(name: str, node: str, namespace: str) -> str:
     own = f'{namespace.rstrip("/")}/'
     if name.startswith(f'{own}{node}/'):
@@ -135,7 +158,7 @@ def from_xml(text: str) -> list[Rights]:
                 if not names or any(entry.tag != single for entry in listed) or not all(names):
                     raise ValueError(f'{enclave.get("path")}: {listed.tag} needs {single} entries')
                 if any('*' in name or '?' in name for name in names):
-                    raise ValueError(f'{enclave.get("path")}: a pattern allows more than is needed')
+                    raise ValueError(f'{enclave.get("path")}: a pattern allows too much')
                 found.setdefault(attribute, set()).update(names)
         result.append(Rights(
             enclave.get('path', ''), profile.get('ns', ''), profile.get('node', ''),

@@ -174,10 +174,12 @@ def test_launch_declares_every_argument(launch_system: None, file: str, module: 
 def test_frames_follow_the_head_file(launch_system: None, tmp_path: Path, file: str) -> None:
     head_file = tmp_path / 'longer.yaml'
     head_file.write_text(nominal_head_path().read_text().replace('0.080', '0.123'))
-    for given, expected in (({}, NOMINAL_URDF), ({'head_file': str(head_file)}, 'xyz="0.123 0 0"')):
+    for given, expected in (({}, NOMINAL_URDF),
+                            ({'head_file': str(head_file)}, 'xyz="0.123 0 0"')):
         nodes, _ = execute(describe(file), namespace='left/head', **given)
         publisher = next(n for n in nodes if n.package == 'robot_state_publisher')
-        assert publisher.namespace == 'left/head'
+        assert publisher.namespace == '/left/head'
+        assert publisher.ros_arguments == ['--enclave', '/left/head/robot_state_publisher']
         assert expected in publisher.values['robot_description']
     nodes, _ = execute(describe(file), publish_frames='false')
     assert all(node.package.startswith('ps_') for node in nodes)
@@ -186,7 +188,7 @@ def test_frames_follow_the_head_file(launch_system: None, tmp_path: Path, file: 
 def test_rviz_is_started_in_the_namespace_of_the_cell(launch_system: None) -> None:
     nodes, _ = execute(describe('ps_inspection/launch/inspection.launch.py'), rviz='true')
     (rviz,) = (node for node in nodes if node.package == 'rviz2')
-    assert rviz.namespace == 'ps_head'
+    assert rviz.namespace == '/ps_head'
     assert rviz.arguments[0] == '--display-config'
     assert Path(rviz.arguments[1]).is_file()
 

@@ -42,14 +42,14 @@ def draw(head: HeadModel, path: Path) -> None:
             arm = np.stack([hinge, pose.center])[:, [0, 2]] * _MM
             ax.plot(*arm.T, color=_INK, lw=1.2, alpha=alpha)
             _panel(ax, pose, _BRIGHT, alpha)
-        _panel(ax, dark.panel_pose(name, dark.tilt_limits[1]), _DARK, 1.0)  # type: ignore[arg-type]
+        low = dark.panel_pose(name, dark.tilt_limits[1])      # type: ignore[arg-type]
+        _panel(ax, low, _DARK, 1.0)
     reach = 1.2 * (head.bright_field.hinge.r + head.bright_field.arm.along)
     ax.plot([-reach * _MM, reach * _MM], [0, 0], color=_INK, lw=1)
 
-    for frame, note in ((LINK_FRAME, (-150, -14)), (OPTICAL_FRAME, (-228, -4)),
-                        (PLANE_FRAME, (16, -24))):
-        pose = to_plane if frame == LINK_FRAME else to_plane @ chain(static_transforms(head), frame)
-        _frame(ax, pose, frame, note)
+    _frame(ax, to_plane, LINK_FRAME, (-150, -14))
+    for frame, note in ((OPTICAL_FRAME, (-228, -4)), (PLANE_FRAME, (16, -24))):
+        _frame(ax, to_plane @ chain(static_transforms(head), frame), frame, note)
     right = reach * 1.1
     _height(ax, right, 0, standoff, f'camera_standoff {standoff * _MM:.0f} mm')
     _height(ax, right, standoff, face, f'{abs(face - standoff) * _MM:.0f} mm')
@@ -88,7 +88,7 @@ def _panel(ax: Axes, pose: PanelPose, colour: str, alpha: float) -> None:
     ax.plot(*np.stack([center - half, center + half]).T, color=colour, lw=5, alpha=alpha,
             solid_capstyle='butt')
     if alpha == 1.0 and center[1] > 0:
-        ax.annotate('', center + 26 * axis, center,
+        ax.annotate('', tuple(center + 26 * axis), tuple(center),
                     arrowprops={'arrowstyle': '-|>', 'color': colour, 'lw': 1})
 
 
@@ -99,14 +99,15 @@ def _frame(ax: Axes, pose: NDArray, name: str, note: tuple[float, float]) -> Non
         seen = direction[[0, 2]]
         if np.linalg.norm(seen) > 0.2:
             tip = origin + length * seen
-            ax.annotate('', tip, origin, arrowprops={
+            ax.annotate('', tuple(tip), tuple(origin), arrowprops={
                 'arrowstyle': '-|>', 'color': colour, 'lw': 2.2, 'shrinkA': 0, 'shrinkB': 0})
-            ax.text(*(tip + 7 * seen), letter, color=colour, ha='center', va='center',
+            x, y = tip + 7 * seen
+            ax.text(x, y, letter, color=colour, ha='center', va='center',
                     fontsize=10, weight='bold')
         else:
             ax.plot(*origin, 'o', ms=9, mfc='white', mec=colour, mew=1.8, zorder=5)
             ax.plot(*origin, '.' if direction[1] < 0 else 'x', ms=5, color=colour, zorder=6)
-    ax.annotate(name, origin, note, textcoords='offset points', fontsize=9.5, color=_INK,
+    ax.annotate(name, tuple(origin), note, textcoords='offset points', fontsize=9.5, color=_INK,
                 family='monospace', bbox={'fc': 'white', 'ec': 'none', 'alpha': 0.8, 'pad': 1})
 
 

@@ -47,7 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
         elif not (given.json or given.drawing):
             sys.stdout.write(text)
         if given.drawing:
-            from ps_head_driver.cli.frames_drawing import draw      # slow to import
+            from ps_head_driver.cli.frames_drawing import draw  # slow to import
             draw(head, given.drawing)
         if given.json:
             given.json.write_text(json.dumps({'transforms': [

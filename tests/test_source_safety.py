@@ -1,9 +1,13 @@
 """No code path runs data as code: no pickle, no eval, no shell, only the safe YAML loader."""
 import ast
+import importlib
 from pathlib import Path
+import re
 import subprocess
 
 import pytest
+
+from ps_inspection.graph import NODES
 
 ROOT = Path(__file__).resolve().parents[1]
 # modules that build objects or code from data
@@ -69,3 +73,12 @@ def test_no_data_are_run_as_code():
     found = [f'{path.relative_to(ROOT)}: {offence}' for path in files if path.is_file()
              for offence in offences(ast.parse(path.read_text()))]
     assert not found, '\n'.join(found)
+
+
+@pytest.mark.parametrize('node', NODES, ids=lambda node: node.executable)
+def test_parameters_that_name_files_are_read_once(node):
+    """Else whoever may set parameters could make the node read or write elsewhere."""
+    module = importlib.import_module(f'{node.package}.nodes.{node.executable}')
+    changeable = [p.name for p in module.PARAMETERS if not p.read_only and
+                  re.search(r'(file|folder|port|socket|directory|path)$', p.name)]
+    assert not changeable

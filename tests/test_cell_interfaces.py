@@ -3,6 +3,9 @@ from collections.abc import Callable, Iterator
 import importlib
 import json
 from pathlib import Path
+import re
+import subprocess
+import sys
 import time
 from typing import Any
 
@@ -170,3 +173,14 @@ def test_viewer_may_see_what_the_files_show(observer: Node) -> None:
     shown |= {f'/ps_head/{display["Topic"]["Value"]}' for display in
               RVIZ['Visualization Manager']['Displays'] if 'Topic' in display}
     assert shown <= viewer.absolute('subscribe')
+
+
+def test_program_of_the_readme_runs(cell: Cell, tmp_path: Path) -> None:
+    (program,) = re.findall(r'```python\n(.*?)```', (CONFIG.parents[3] / 'README.md').read_text(),
+                            re.S)
+    script = tmp_path / 'program.py'
+    script.write_text(program)
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120,
+                          check=False)
+    assert done.returncode == 0, done.stderr
+    assert re.fullmatch(r'1280 x 1024 pixels, \d+% valid\n', done.stdout)

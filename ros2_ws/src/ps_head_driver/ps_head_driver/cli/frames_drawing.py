@@ -61,7 +61,7 @@ def draw(head: HeadModel, path: Path) -> None:
            ylim=(-50, max(face, standoff) * _MM + 60))
     ax.axis('off')
     try:
-        figure.savefig(path, dpi=130)
+        figure.savefig(path, dpi=130, bbox_inches='tight')
     except ValueError as error:      # matplotlib's word for a suffix it does not know
         raise OSError(22, str(error).split(' (')[0], str(path)) from error
 

@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 
 from ps_calibration.ring_fit import (
     RingFit,
-    Shares,
     blocked_slits,
     corrected,
     fit_ring,
-    measure_shares,
     predicted_shares,
 )
 from ps_calibration.ring_pictures import (
@@ -26,6 +24,7 @@ from ps_calibration.ring_pictures import (
     require_labels,
 )
 from ps_calibration.ring_target import RingTarget
+from ps_calibration.shares import Shares, measure_shares
 from ps_calibration.target_pose import camera_to_plane
 from ps_calibration.verdict import judge
 from ps_head_driver.calibration_file import HeadCalibration, PanelCorrection, new_calibration_id

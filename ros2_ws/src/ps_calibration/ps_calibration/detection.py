@@ -5,8 +5,10 @@ import math
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from ps_calibration.ring_target import RingTarget
+from ps_calibration.robust import soft
 from ps_head_driver.camera_model import plane_points
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import CameraGeometry
@@ -18,6 +20,8 @@ _DARK = 0.30
 _AREA, _SCALE = (0.5, 1.6), 0.08
 _ASTRAY = 0.0012         # m, of a dot from where the other ones predict it
 _MOST = 40               # dark spots looked at
+_SPECK = 0.1             # of the light; what differs more counts less
+_RADIUS = 4.0            # px; as large as this a dot is easily found
 
 
 def find_dots(picture: NDArray, target: RingTarget, camera: CameraGeometry) -> NDArray:
@@ -31,7 +35,12 @@ def find_dots(picture: NDArray, target: RingTarget, camera: CameraGeometry) -> N
     picture = picture.astype(np.float32)
     pixel = camera.camera_standoff / camera.fx
     radius = target.fiducials.radius / pixel
-    spots = _dark_spots(picture, radius)
+    # finding them needs few pixels, placing them all
+    part = max(1, int(radius / _RADIUS))
+    height, width = (n // part * part for n in picture.shape)
+    small = cv2.resize(picture[:height, :width], (width // part, height // part),
+                       interpolation=cv2.INTER_AREA)
+    spots = part * _dark_spots(small, radius / part) + (part - 1) / 2
     dots = np.array(target.fiducials.centres)
     if len(spots) < len(dots):
         raise PsError(ErrorCode.CALIBRATION_TARGET_NOT_FOUND,
@@ -90,22 +99,28 @@ def _match(points: NDArray, dots: NDArray) -> list[int] | None:
 
 
 def _refine(picture: NDArray, centre: NDArray, radius: float) -> NDArray:
-    """Centroid of the missing light against a plane fitted to the surroundings, (2,) px."""
-    reach = math.ceil(1.8 * radius) + 2
-    centre = centre.copy()
-    for _ in range(3):
-        column, row = (int(c) for c in centre.round())
-        rows = slice(max(row - reach, 0), row + reach + 1)
-        columns = slice(max(column - reach, 0), column + reach + 1)
-        patch = picture[rows, columns].astype(np.float64)
-        v, u = np.mgrid[:patch.shape[0], :patch.shape[1]]
-        u, v = u + columns.start - centre[0], v + rows.start - centre[1]
-        distance = np.hypot(u, v)
-        ring = (distance > 1.35 * radius) & (distance < 1.8 * radius)
-        terms = np.stack([np.ones_like(u), u, v], axis=-1)
-        plane = terms @ np.linalg.lstsq(terms[ring], patch[ring], rcond=None)[0]
-        # smooth window: a pixel must not jump in or out as the centre moves
-        window = np.clip((1.35 * radius - distance) + 0.5, 0, 1)
-        missing = window * (1 - patch / plane)
-        centre += [np.sum(missing * u) / missing.sum(), np.sum(missing * v) / missing.sum()]
-    return centre
+    """Centre of a dot, (2,) px: a disc with a soft edge on evenly changing light, fitted.
+
+    Only its edge tells where a dot is; a centroid would add the noise of everything around it.
+    """
+    reach = math.ceil(1.7 * radius) + 1
+    column, row = (int(c) for c in centre.round())
+    rows = slice(max(row - reach, 0), row + reach + 1)
+    columns = slice(max(column - reach, 0), column + reach + 1)
+    patch = picture[rows, columns].astype(np.float64)
+    v, u = np.mgrid[:patch.shape[0], :patch.shape[1]]
+    u, v = u + columns.start - centre[0], v + rows.start - centre[1]
+    inside = np.hypot(u, v) < 1.7 * radius
+    u, v, patch = u[inside], v[inside], patch[inside]
+    level = float(np.median(patch))
+
+    def errors(x: NDArray) -> NDArray:
+        """x: centre, radius and softness of the edge, contrast; level and slopes of the light."""
+        beyond = (np.hypot(u - x[0], v - x[1]) - x[2]) / max(abs(x[3]), 0.05)
+        dark = 1 / (1 + np.exp(np.clip(beyond, -30, 30)))
+        light = x[5] + (x[6] * u + x[7] * v) / radius
+        return soft((light * (1 - x[4] * dark) - patch / level) / _SPECK)[0]
+
+    fit = least_squares(errors, [0, 0, radius, 0.5, 0.9, 1, 0, 0], method='lm',
+                        x_scale=[0.1, 0.1, 0.1, 0.3, 0.1, 0.1, 0.1, 0.1], max_nfev=300)
+    return np.asarray(centre + fit.x[:2])

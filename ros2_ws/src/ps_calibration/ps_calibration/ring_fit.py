@@ -6,16 +6,16 @@ remain. All motor positions, all panels and the target's pose are fitted togethe
 loss, starting from the kinematics.
 """
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
-import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 
 from ps_calibration.ring_target import RingTarget
-from ps_calibration.shadow_model import plate_irradiance
+from ps_calibration.robust import soft
+from ps_calibration.shadow_model import light_and_rates, plate_irradiance
+from ps_calibration.shares import Shares
 from ps_calibration.target_pose import SIZE, TargetPose, dot_errors
 from ps_head_driver.camera_model import plane_points
 from ps_head_driver.head_model import DIRECTIONS, CameraGeometry, HeadModel
@@ -26,34 +26,14 @@ PER_PANEL = 6
 # what is known of them beforehand: three times the tolerances of manufacture
 _PRIOR = np.array([0.009, 0.009, 0.009, 0.105, 0.105, 0.15])
 _TILT_PRIOR = 0.03                       # rad, error of the motor between two positions
-_STEPS = np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3])        # of finite differences
+# typical sizes of the parameters
+_STEPS = np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3])
 _POSE_STEPS = np.array([1e-5, 1e-5, 1e-5, 1e-3, 5e-4, 5e-4])
 _HEIGHT_STEP, _TILT_STEP = 2e-5, 1e-3
-# what is expected of the models of soft shadows near the wall and of the smooth rest. The dots
-# weigh more than their noise asks for: errors of the soft shadows, alike in many blocks, must not
-# tilt the plane
-_MODEL_NEAR, _MODEL_FAR, _DOT_NOISE_PX = 1e-3, 5e-5, 0.001
-_CLEAR = 0.0006          # m; the camera looks past the wall's edge, and a block has a width
-_BLOCK = 1.6e-4          # m on the plate, edge of the smallest blocks of pixels
-_REACH = 0.006           # m; no shadow is longer
-_PART, _FAR = 7, 6       # one block in _PART is used up to there; beyond, _FAR x _FAR are averaged
+_POINT_STEP = 1e-5                       # m
+_DOT_NOISE_PX = 0.003
+_THIN = 6                # one block in so many gets the fit close
 _SOFT = 3.0              # standard deviations from which on a residual counts less
-
-
-@dataclass(frozen=True)
-class Shares:
-    """What one motor position's pictures say about the light.
-
-    :param tilt: nominal, rad.
-    :param pixels: (N, 2) float64, column and row of the middles of the blocks.
-    :param values: (4, N) float64, share of E, N, W, S in their sum.
-    :param noise: (N,) float64, standard deviation expected of them.
-    """
-
-    tilt: float
-    pixels: NDArray
-    values: NDArray
-    noise: NDArray
 
 
 @dataclass(frozen=True)
@@ -102,63 +82,6 @@ def corrected(head: HeadModel, panels: NDArray) -> HeadModel:
         update={'bright_field': head.bright_field.model_copy(update={'panels': ring})})
 
 
-def measure_shares(pictures: Sequence[NDArray], tilt: float, pose: TargetPose,
-                   target: RingTarget, camera: CameraGeometry) -> Shares:
-    """Average the pictures of one motor position over blocks where only the plate is seen.
-
-    :param pictures: E, N, W, S, (H, W) float, room light subtracted, equal exposure.
-    :param tilt: nominal, rad.
-    """
-    side = max(1, round(_BLOCK * camera.fx / camera.camera_standoff))
-    rows, columns = (n // side for n in pictures[0].shape)
-    blocks = np.stack([
-        p[:rows * side, :columns * side].reshape(rows, side, columns, side).mean(axis=(1, 3))
-        for p in pictures]).reshape(4, -1)
-    middle = (side - 1) / 2
-    v, u = np.mgrid[:rows, :columns] * side + middle
-    pixels = np.stack([u, v], axis=-1).reshape(-1, 2)
-    points = pose.to_target(plane_points(camera, pixels, pose.plane))
-    x, y = points[:, 0], points[:, 1]
-    half = np.array(target.base.size) / 2 - _CLEAR
-    total = blocks.sum(axis=0)
-    distance = target.distance(x, y)
-    keep = (distance > _CLEAR) & (np.hypot(x, y) > _CLEAR) & (
-        abs(x) < half[0]) & (abs(y) < half[1]) & (total > 0.1 * np.median(total))
-    for dot in target.fiducials.centres:
-        keep &= np.hypot(x - dot[0], y - dot[1]) > target.fiducials.radius + _CLEAR / 2
-    grid = np.concatenate([blocks, pixels.T]).reshape(6, rows, columns)
-    parts = []
-    i, j = (pixels // side).astype(int).T
-    for size, here in ((1, (distance < _REACH) & ((i + 3 * j) % _PART == 0)),
-                       (_FAR, distance >= _REACH)):
-        whole = _merge((keep & here).reshape(1, rows, columns), size)[0] == 1
-        parts.append(_merge(grid, size)[:, whole])
-    merged = np.concatenate(parts, axis=1)
-    values = merged[:4] / merged[:4].sum(axis=0)
-    return Shares(tilt, merged[4:].T.copy(), values,
-                  _noise([part[:4] / part[:4].sum(axis=0) for part in parts]))
-
-
-def _merge(grid: NDArray, size: int) -> NDArray:
-    """Means of size x size neighbours, (K, H, W) to (K, H // size, W // size)."""
-    rows, columns = (n // size for n in grid.shape[1:])
-    return np.asarray(grid[:, :rows * size, :columns * size].reshape(
-        -1, rows, size, columns, size).mean(axis=(2, 4), dtype=np.float64))
-
-
-def _noise(parts: Sequence[NDArray]) -> NDArray:
-    """Standard deviation of each share: its pixels' noise and the model's own errors, (N,).
-
-    The noise is seen in the differences of neighbours far from the wall.
-    """
-    far = parts[1]
-    change = np.diff(far, 2, axis=1)[:, np.abs(np.diff(far, 2, axis=1)).max(axis=0) < 0.05]
-    pixel = 1.4826 * float(np.median(abs(change))) / math.sqrt(6) if change.size else 0.0
-    return np.concatenate([
-        np.full(parts[0].shape[1], math.hypot(pixel * _FAR, _MODEL_NEAR)),
-        np.full(far.shape[1], math.hypot(pixel, _MODEL_FAR))])
-
-
 class _Problem:
     """Residuals and their derivatives as functions of all parameters.
 
@@ -167,7 +90,7 @@ class _Problem:
     """
 
     def __init__(self, head: HeadModel, target: RingTarget, camera: CameraGeometry,
-                 shares: Sequence[Shares], dots_px: NDArray, free_height: bool) -> None:
+                 shares: Sequence[Shares], dots_px: NDArray, free_height: bool = False) -> None:
         self.head, self.target, self.camera = head, target, camera
         self.shares, self.dots_px, self.free_height = shares, dots_px, free_height
         self.first_tilt = 4 * PER_PANEL + SIZE
@@ -175,7 +98,9 @@ class _Problem:
         self.prior = np.full(self.size, np.inf)
         self.prior[:4 * PER_PANEL] = np.tile(_PRIOR, 4)
         self.prior[self.first_tilt:self.first_tilt + len(shares) - 1] = _TILT_PRIOR
-        self._at: tuple[NDArray, list[NDArray]] | None = None
+        self.scale = np.concatenate([np.tile(_STEPS, 4), _POSE_STEPS,
+                                     np.full(len(shares) - 1, _TILT_STEP),
+                                     np.full(int(free_height), _HEIGHT_STEP)])
 
     def pose(self, x: NDArray) -> TargetPose:
         return TargetPose(x[4 * PER_PANEL:self.first_tilt])
@@ -187,85 +112,100 @@ class _Problem:
     def height(self, x: NDArray) -> float:
         return float(x[-1]) if self.free_height else self.target.height
 
-    def panel_light(self, x: NDArray, position: int, panel: int) -> NDArray:
-        """Irradiance of all blocks of one position under one panel, (N,)."""
+    def points(self, x: NDArray, position: int) -> NDArray:
+        """Where the blocks are on the plate, (N, 2), target frame."""
+        pose = self.pose(x)
+        there = plane_points(self.camera, self.shares[position].pixels, pose.plane)
+        return pose.to_target(there)[:, :2]
+
+    def panels(self, x: NDArray, position: int) -> list[PanelPose]:
+        """The four panels in the target frame."""
         pose = self.pose(x)
         panels = x[:4 * PER_PANEL].reshape(4, PER_PANEL)
         ring = PanelRing(corrected(self.head, panels).bright_field)
-        where = ring.pose(DIRECTIONS[panel], self.tilt(x, position))  # type: ignore[arg-type]
-        points = plane_points(self.camera, self.shares[position].pixels, pose.plane)
-        there = PanelPose(pose.to_target(where.center), where.axis @ pose.rotation,
-                          where.right @ pose.rotation, where.size, where.lobe_exponent, 1.0)
-        return where.intensity * plate_irradiance(
-            pose.to_target(points)[:, :2], there, self.height(x), self.target.footprint)
+        found = [ring.pose(name, self.tilt(x, position))  # type: ignore[arg-type]
+                 for name in DIRECTIONS]
+        return [replace(panel, center=pose.to_target(panel.center),
+                        axis=panel.axis @ pose.rotation, right=panel.right @ pose.rotation)
+                for panel in found]
 
     def lights(self, x: NDArray) -> list[NDArray]:
         """Irradiance per position, (4, N)."""
-        if self._at is None or not np.array_equal(self._at[0], x):
-            self._at = (x.copy(), [np.stack([self.panel_light(x, k, i) for i in range(4)])
-                                   for k in range(len(self.shares))])
-        return self._at[1]
+        return [self._light(self.points(x, k), self.panels(x, k), self.height(x))
+                for k in range(len(self.shares))]
+
+    def _light(self, points: NDArray, panels: Sequence[PanelPose], height: float) -> NDArray:
+        return np.stack([panel.intensity * plate_irradiance(
+            points, panel, height, self.target.footprint) for panel in panels])
+
+    def light_rates(self, x: NDArray, position: int) -> tuple[NDArray, NDArray]:
+        """Irradiance (4, N) and its derivatives by all parameters, (size, 4, N).
+
+        All that moves a panel are shifts and turns of a rigid body, so two kinds of derivatives
+        suffice: by the panel's motion, and by the point's on the plate.
+        """
+        points, panels, height = self.points(x, position), self.panels(x, position), self.height(x)
+        lit = [light_and_rates(points, panel, height, self.target.footprint) for panel in panels]
+        gains = [panel.intensity for panel in panels]
+        light = np.stack([gain * part[0] for gain, part in zip(gains, lit, strict=True)])
+        by_motion = [gain * part[1] for gain, part in zip(gains, lit, strict=True)]
+        by_point = [(self._light(points + shift, panels, height) - light) / _POINT_STEP
+                    for shift in _POINT_STEP * np.eye(2)]
+        rates = np.zeros((self.size, *light.shape))
+        for k in range(self.size):
+            moved, step = x.copy(), self.scale[k] * 0.1
+            moved[k] += step
+            if self.free_height and k == self.size - 1:
+                rates[k] = (self._light(points, panels, height + step) - light) / step
+            elif k < 4 * PER_PANEL and k % PER_PANEL == PER_PANEL - 1:
+                rates[k, k // PER_PANEL] = light[k // PER_PANEL]
+            elif k < self.first_tilt or k == self.first_tilt + position - 1:
+                own = (range(4) if k >= 4 * PER_PANEL else [k // PER_PANEL])
+                after = self.panels(moved, position)
+                for i in own:
+                    rates[k, i] = by_motion[i] @ _motion(panels[i], after[i]) / step
+            if 4 * PER_PANEL <= k < self.first_tilt:
+                shift = (self.points(moved, position) - points) / step
+                rates[k] += by_point[0] * shift[:, 0] + by_point[1] * shift[:, 1]
+        return light, rates
+
+    def share_rates(self, x: NDArray, position: int) -> NDArray:
+        """Derivatives of the predicted shares by all parameters, (size, 4, N)."""
+        light, rates = self.light_rates(x, position)
+        total = light.sum(axis=0)
+        return np.asarray((rates - light / total * rates.sum(axis=1, keepdims=True)) / total)
 
     def residuals(self, x: NDArray) -> NDArray:
-        """Normalised by the noise expected."""
-        parts = [((light / light.sum(axis=0) - share.values) / share.noise).ravel()
+        """Normalised by the noise expected; specks in the pictures count less."""
+        parts = [soft(-_residual(light, share) / (share.noise * _SOFT))[0]
                  for light, share in zip(self.lights(x), self.shares, strict=True)]
         dots = dot_errors(self.pose(x).numbers, self.dots_px, self.target, self.camera)
-        return np.concatenate([*parts, dots / _DOT_NOISE_PX, x / self.prior])
-
-    def loss(self, squares: NDArray) -> NDArray:
-        """Soft L1 for the pictures, in which specks happen; none for dots and prior.
-
-        :param squares: of the residuals, (M,).
-        :returns: (3, M): loss and its two derivatives, as scipy wants it.
-        """
-        root = np.sqrt(1 + squares / _SOFT**2)
-        rho = np.stack([2 * _SOFT**2 * (root - 1), 1 / root, -0.5 / (_SOFT**2 * root**3)])
-        trusted = self.dots_px.size + self.size
-        rho[:, -trusted:] = squares[-trusted:], np.ones(trusted), np.zeros(trusted)
-        return rho
+        return np.concatenate([*(_SOFT * part.ravel() for part in parts), dots / _DOT_NOISE_PX,
+                               x / self.prior])
 
     def jacobian(self, x: NDArray) -> NDArray:
-        """Finite differences; each panel's own parameters change its light alone."""
+        """Derivatives of the residuals, (M, size)."""
+        parts = []
         lights = self.lights(x)
-        columns = []
-        for k in range(self.size):
-            step, panels = self._step(k)
-            moved = x.copy()
-            moved[k] += step
-            parts = []
-            for position, light in enumerate(lights):
-                total = light.sum(axis=0)
-                change = np.zeros_like(light)
-                if not self.first_tilt <= k < self.first_tilt + len(self.shares) - 1 or (
-                        k - self.first_tilt + 1 == position):
-                    for panel in panels:
-                        after = light[panel] * np.exp(step) if (
-                            len(panels) == 1 and k % PER_PANEL == PER_PANEL - 1
-                        ) else self.panel_light(moved, position, panel)
-                        change[panel] = (after - light[panel]) / step
-                share = (change - light / total * change.sum(axis=0)) / total
-                parts.append((share / self.shares[position].noise).ravel())
-            dots = np.zeros(self.dots_px.size)
-            if 4 * PER_PANEL <= k < self.first_tilt:
-                dots = (dot_errors(self.pose(moved).numbers, self.dots_px, self.target,
-                                   self.camera)
-                        - dot_errors(self.pose(x).numbers, self.dots_px, self.target,
-                                     self.camera)) / (step * _DOT_NOISE_PX)
-            columns.append(np.concatenate([*parts, dots, np.eye(self.size)[k] / self.prior]))
-        return np.stack(columns, axis=1)
+        for k, (light, share) in enumerate(zip(lights, self.shares, strict=True)):
+            slope = soft(_residual(light, share) / (share.noise * _SOFT))[1]
+            parts.append((self.share_rates(x, k) * (slope / share.noise)).reshape(self.size, -1))
+        dots = np.zeros((self.size, self.dots_px.size))
+        numbers = self.pose(x).numbers
+        here = dot_errors(numbers, self.dots_px, self.target, self.camera)
+        for k, step in enumerate(0.1 * _POSE_STEPS):
+            there = dot_errors(numbers + step * np.eye(SIZE)[k], self.dots_px, self.target,
+                               self.camera)
+            dots[4 * PER_PANEL + k] = (there - here) / (step * _DOT_NOISE_PX)
+        return np.concatenate([*parts, dots, np.diag(1 / self.prior)], axis=1).T
 
-    def _step(self, k: int) -> tuple[float, Sequence[int]]:
-        if k < 4 * PER_PANEL:
-            return float(_STEPS[k % PER_PANEL]), [k // PER_PANEL]
-        if k < self.first_tilt:
-            return float(_POSE_STEPS[k - 4 * PER_PANEL]), range(4)
-        return (_HEIGHT_STEP if self.free_height and k == self.size - 1 else _TILT_STEP), range(4)
 
-    @cached_property
-    def scale(self) -> NDArray:
-        """Typical sizes of the parameters."""
-        return np.array([10 * self._step(k)[0] for k in range(self.size)])
+def _motion(before: PanelPose, after: PanelPose) -> NDArray:
+    """Small shift and turn from one pose to another, (6,)."""
+    first, second = (np.stack([pose.axis, pose.right, np.cross(pose.axis, pose.right)])
+                     for pose in (before, after))
+    return np.concatenate([after.center - before.center,
+                           0.5 * np.cross(first, second - first).sum(axis=0)])
 
 
 def fit_ring(head: HeadModel, target: RingTarget, camera: CameraGeometry,
@@ -281,7 +221,8 @@ def fit_ring(head: HeadModel, target: RingTarget, camera: CameraGeometry,
     :param start: an earlier fit to start from instead.
     :param free_height: fit the height of the wall, too: a check of the scale of z.
     """
-    problem = _Problem(head, target, camera, shares, dots_px, free_height)
+    problem = _Problem(head, target, camera, [share.thinned(_THIN) for share in shares], dots_px,
+                       free_height)
     x = np.zeros(problem.size)
     x[4 * PER_PANEL:problem.first_tilt] = pose.numbers
     if start is not None:
@@ -291,14 +232,30 @@ def fit_ring(head: HeadModel, target: RingTarget, camera: CameraGeometry,
             x[problem.first_tilt + k - 1] = start.tilts[k] - shares[k].tilt
     if free_height:
         x[-1] = target.height
-    fit = least_squares(problem.residuals, x, problem.jacobian, loss=problem.loss,
-                        x_scale=problem.scale, max_nfev=15, xtol=1e-8, ftol=1e-7)
+    fit = _solve(problem, x)
+    if free_height:
+        return _summary(problem, fit.x, fit.jac)
+    # what remains tells how far to trust the shadows and the rest
+    whole = [share.reweighed(_residual(light, part)) for share, part, light in zip(
+        shares, problem.shares, problem.lights(fit.x), strict=True)]
+    problem = _Problem(head, target, camera, whole, dots_px)
+    fit = _solve(problem, fit.x)
     return _summary(problem, fit.x, fit.jac)
+
+
+def _solve(problem: _Problem, x: NDArray) -> OptimizeResult:
+    return least_squares(problem.residuals, x, problem.jacobian, method='lm', max_nfev=20,
+                         x_scale=10 * problem.scale, xtol=1e-8, ftol=1e-6)
+
+
+def _residual(light: NDArray, share: Shares) -> NDArray:
+    """Measured minus predicted, (4, N)."""
+    return np.asarray(share.values - light / light.sum(axis=0))
 
 
 def _summary(problem: _Problem, x: NDArray, jacobian: NDArray) -> RingFit:
     lights = problem.lights(x)
-    residuals = [share.values - light / light.sum(axis=0)
+    residuals = [_residual(light, share)
                  for light, share in zip(lights, problem.shares, strict=True)]
     normalised = np.concatenate([(r / share.noise).ravel()
                                  for r, share in zip(residuals, problem.shares, strict=True)])
@@ -331,7 +288,7 @@ def _summary(problem: _Problem, x: NDArray, jacobian: NDArray) -> RingFit:
 def predicted_shares(head: HeadModel, target: RingTarget, camera: CameraGeometry,
                      shares: Shares, pose: TargetPose) -> NDArray:
     """Shares of light of a head as it is, for the blocks of ``shares``, (4, N)."""
-    problem = _Problem(head, target, camera, [shares], np.zeros((0, 2)), False)
+    problem = _Problem(head, target, camera, [shares], np.zeros((0, 2)))
     x = np.zeros(problem.size)
     x[4 * PER_PANEL:problem.first_tilt] = pose.numbers
     light = problem.lights(x)[0]
@@ -344,7 +301,7 @@ def blocked_slits(fit: RingFit, head: HeadModel, target: RingTarget, camera: Cam
 
     The residuals are compared with the change that filling the slit would make.
     """
-    problem = _Problem(head, target, camera, shares, np.zeros((0, 2)), False)
+    problem = _Problem(head, target, camera, shares, np.zeros((0, 2)))
     x = np.concatenate([fit.panels.ravel(), fit.pose.numbers,
                         [tilt - share.tilt for tilt, share in zip(fit.tilts, shares, strict=True)
                          ][1:]])
@@ -353,7 +310,7 @@ def blocked_slits(fit: RingFit, head: HeadModel, target: RingTarget, camera: Cam
     for k in range(len(azimuths)):
         slits = target.slits.model_copy(update={'azimuths': azimuths[:k] + azimuths[k + 1:]})
         filled = _Problem(head, target.model_copy(update={'slits': slits}), camera, shares,
-                          np.zeros((0, 2)), False)
+                          np.zeros((0, 2)))
         change = np.concatenate([(light / light.sum(axis=0) - before).ravel() for light, before in
                                  zip(filled.lights(x), open_shares, strict=True)])
         residual = np.concatenate([r.ravel() for r in fit.residuals])

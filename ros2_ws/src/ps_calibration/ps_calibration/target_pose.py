@@ -1,5 +1,6 @@
 """Where a target lies under the camera: from its dots to plane, pose and homography."""
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -31,7 +32,7 @@ class TargetPose:
         """Origin, (3,) m."""
         return self.numbers[:3]
 
-    @property
+    @cached_property
     def rotation(self) -> NDArray:
         """(3, 3); columns are the target's axes."""
         tilt = Rotation.from_rotvec([self.numbers[4], self.numbers[5], 0.0])

@@ -238,40 +238,57 @@ def _look(origin, rays, ring, ends, slits, plate, dots, dot_radius, reflectance,
     return out
 
 
+@nb.njit(cache=True, inline='always')
+def _emission(point, dx, dy, dz, axis, lobe):  # type: ignore[no-untyped-def]
+    """Irradiance of a point under a unit of area of the panel, (dx, dy, dz) away."""
+    facing = -(axis[0] * dx + axis[1] * dy + axis[2] * dz)
+    steep = point[3] * dx + point[4] * dy + point[5] * dz
+    if facing <= 0.0 or steep <= 0.0:
+        return 0.0
+    square = dx * dx + dy * dy + dz * dz
+    distance = math.sqrt(square)
+    cos_e = facing / distance
+    return (cos_e if lobe == 1.0 else cos_e ** lobe) * steep / (distance * square)
+
+
 @nb.njit(cache=True, parallel=True)
-def _light(points, free, probes, shadowed, axis, lobe, ring, ends, slits):  # type: ignore[no-untyped-def]
-    """Irradiance of each point under one panel, all in the target frame."""
+def _light(points, free, probes, shadowed, part, axis, lobe, ring, ends, slits):  # type: ignore[no-untyped-def]
+    """Irradiance of each point under one panel, all in the target frame.
+
+    :param part: (2, 3) sides of the part of the panel that one of the ``shadowed`` stands for.
+    """
     out = np.zeros(points.shape[0], np.float32)
     height = ring[2]
     for k in nb.prange(points.shape[0]):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
-        radius = math.hypot(x, y)
+        total = 0.0
+        for e in range(free.shape[0]):
+            total += free[e, 3] * _emission(points[k], free[e, 0] - x, free[e, 1] - y,
+                                            free[e, 2] - z, axis, lobe)
         # the sides and the middle of the panel tell whether any shadow falls here
         near = False
-        if z < height and radius < 2.0 * ring[1]:
+        if z < height and math.hypot(x, y) < 2.0 * ring[1]:
             for e in range(probes.shape[0]):
                 dx, dy = probes[e, 0] - x, probes[e, 1] - y
                 s = (height - z) / (probes[e, 2] - z)
                 if _blocked(x, y, s * dx, s * dy, ring, ends, slits):
                     near = True
                     break
-        sources = shadowed if near else free
-        total = 0.0
-        for e in range(sources.shape[0]):
-            dx, dy, dz = sources[e, 0] - x, sources[e, 1] - y, sources[e, 2] - z
-            facing = -(axis[0] * dx + axis[1] * dy + axis[2] * dz)
-            steep = points[k, 3] * dx + points[k, 4] * dy + points[k, 5] * dz
-            if facing <= 0.0 or steep <= 0.0:
-                continue
-            if near:
+        if near:
+            # every pixel looks at other points of the panel (an additive sequence in two
+            # dimensions), lest soft shadows become stairs alike in neighbouring pixels
+            a, b = 0.7548776662466927 * k % 1.0 - 0.5, 0.5698402909980532 * k % 1.0 - 0.5
+            seen = whole = 0.0
+            for e in range(shadowed.shape[0]):
+                dx = shadowed[e, 0] + a * part[0, 0] + b * part[1, 0] - x
+                dy = shadowed[e, 1] + a * part[0, 1] + b * part[1, 1] - y
+                dz = shadowed[e, 2] + a * part[0, 2] + b * part[1, 2] - z
+                light = _emission(points[k], dx, dy, dz, axis, lobe)
+                whole += light
                 s = (height - z) / dz
-                if _blocked(x, y, s * dx, s * dy, ring, ends, slits):
-                    continue
-            square = dx * dx + dy * dy + dz * dz
-            distance = math.sqrt(square)
-            cos_e, cos_l = facing / distance, steep / distance
-            emitted = cos_e if lobe == 1.0 else cos_e ** lobe
-            total += emitted * cos_l / square * sources[e, 3]
+                if not _blocked(x, y, s * dx, s * dy, ring, ends, slits):
+                    seen += light
+            total *= seen / whole if whole > 0.0 else 0.0
         out[k] = total
     return out
 
@@ -338,11 +355,13 @@ class RingRenderer(Renderer):
                              for side, count in zip(pose.size, _PROBES, strict=True)))
         probes = (pose.center + u[..., None] * pose.right
                   + v[..., None] * np.cross(pose.axis, pose.right)).reshape(-1, 3)
+        part = np.stack([pose.size[0] / _SHADOWED[0] * pose.right,
+                         pose.size[1] / _SHADOWED[1] * np.cross(pose.axis, pose.right)])
         with KERNEL_LOCK:
             return np.asarray(_light(
                 points, seen(_FREE, True), (probes - where.position) @ where.rotation,
-                seen(_SHADOWED, False), pose.axis @ where.rotation, pose.lobe_exponent,
-                self._ring, self._ends, self._slits))
+                seen(_SHADOWED, False), part @ where.rotation, pose.axis @ where.rotation,
+                pose.lobe_exponent, self._ring, self._ends, self._slits))
 
     def capture(self, tilt: float, exposure: float = 1.0) -> list[NDArray]:
         """The six pictures of a calibration: E, N, W, S, ALL at a quarter exposure, NONE.

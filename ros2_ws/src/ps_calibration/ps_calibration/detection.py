@@ -116,11 +116,13 @@ def _refine(picture: NDArray, centre: NDArray, radius: float) -> NDArray:
 
     def errors(x: NDArray) -> NDArray:
         """x: centre, radius and softness of the edge, contrast; level and slopes of the light."""
-        beyond = (np.hypot(u - x[0], v - x[1]) - x[2]) / max(abs(x[3]), 0.05)
-        dark = 1 / (1 + np.exp(np.clip(beyond, -30, 30)))
+        beyond, soft_px = np.hypot(u - x[0], v - x[1]) - x[2], max(abs(x[3]), 0.02)
+        # a logistic edge, averaged over a pixel
+        dark = 1 - soft_px * (np.logaddexp(0, (beyond + 0.5) / soft_px)
+                              - np.logaddexp(0, (beyond - 0.5) / soft_px))
         light = x[5] + (x[6] * u + x[7] * v) / radius
         return soft((light * (1 - x[4] * dark) - patch / level) / _SPECK)[0]
 
-    fit = least_squares(errors, [0, 0, radius, 0.5, 0.9, 1, 0, 0], method='lm',
+    fit = least_squares(errors, [0, 0, radius, 0.3, 0.9, 1, 0, 0], method='lm',
                         x_scale=[0.1, 0.1, 0.1, 0.3, 0.1, 0.1, 0.1, 0.1], max_nfev=300)
     return np.asarray(centre + fit.x[:2])

@@ -7,6 +7,8 @@ loss, starting from the kinematics.
 """
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,6 +140,21 @@ class _Problem:
         return np.stack([panel.intensity * plate_irradiance(
             points, panel, height, self.target.footprint) for panel in panels])
 
+    def blur(self, x: NDArray, position: int) -> NDArray:
+        """What averaging over a block adds to the share in its middle, (4, N)."""
+        share, panels, height = self.shares[position], self.panels(x, position), self.height(x)
+        light = self._light(self.points(x, position), panels, height)
+        mean = np.zeros_like(light)
+        # a share changes fast near the wall alone
+        near, pixels = slice(share.near), share.pixels[:share.near]
+        for sides in product((-1, 1), repeat=2):
+            corner = pixels + share.block_px / math.sqrt(12) * np.array(sides)
+            points = self.pose(x).to_target(plane_points(self.camera, corner, self.pose(x).plane))
+            mean[:, near] += self._light(points[:, :2], panels, height) / 4
+        change = mean[:, near] / mean[:, near].sum(axis=0) - (
+            light[:, near] / light[:, near].sum(axis=0))
+        return np.pad(change, ((0, 0), (0, light.shape[1] - share.near)))
+
     def light_rates(self, x: NDArray, position: int) -> tuple[NDArray, NDArray]:
         """Irradiance (4, N) and its derivatives by all parameters, (size, 4, N).
 
@@ -239,6 +256,9 @@ def fit_ring(head: HeadModel, target: RingTarget, camera: CameraGeometry,
     whole = [share.reweighed(_residual(light, part)) for share, part, light in zip(
         shares, problem.shares, problem.lights(fit.x), strict=True)]
     problem = _Problem(head, target, camera, whole, dots_px)
+    problem = _Problem(head, target, camera, [
+        replace(share, values=share.values - problem.blur(fit.x, k))
+        for k, share in enumerate(whole)], dots_px)
     fit = _solve(problem, fit.x)
     return _summary(problem, fit.x, fit.jac)
 

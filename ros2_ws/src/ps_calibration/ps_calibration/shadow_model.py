@@ -9,6 +9,7 @@ differentiable. Everything is in the target frame.
 """
 import math
 import threading
+from typing import Any
 
 import numba as nb
 import numpy as np
@@ -19,7 +20,7 @@ from ps_head_driver.kinematics import PanelPose
 _NODES_4, _WEIGHTS_4 = np.polynomial.legendre.leggauss(4)
 _NODES_3, _WEIGHTS_3 = np.polynomial.legendre.leggauss(3)
 # no division by zero happens, so none need be looked for
-_FAST = {'cache': True, 'fastmath': True, 'error_model': 'numpy'}
+_FAST: dict[str, Any] = {'cache': True, 'fastmath': True, 'error_model': 'numpy'}
 _PARTS = 8                         # the panel's width is divided into, at least
 _LOCK = threading.Lock()           # numba's plain threading layer allows one caller at a time
 _NEVER = 1.0                       # m; farther than any shadow reaches

@@ -32,6 +32,7 @@ class Shares:
     :param values: (4, N) float64, share of E, N, W, S in their sum.
     :param noise: (N,) float64, standard deviation expected of them.
     :param near: how many of them, the first ones, are near the wall.
+    :param block_px: edge of the blocks near the wall.
     """
 
     tilt: float
@@ -39,11 +40,12 @@ class Shares:
     values: NDArray
     noise: NDArray
     near: int
+    block_px: int
 
     def thinned(self, part: int) -> 'Shares':
         """One block in ``part``."""
         return Shares(self.tilt, self.pixels[::part], self.values[:, ::part], self.noise[::part],
-                      math.ceil(self.near / part))
+                      math.ceil(self.near / part), self.block_px)
 
     def reweighed(self, residuals: NDArray) -> 'Shares':
         """The same with more noise expected, near the wall or elsewhere, where more was found.
@@ -94,7 +96,8 @@ def measure_shares(pictures: Sequence[NDArray], tilt: float, pose: TargetPose,
     merged = np.concatenate(parts, axis=1)
     values = merged[:4] / merged[:4].sum(axis=0)
     return Shares(tilt, merged[4:].T.copy(), values,
-                  _noise([part[:4] / part[:4].sum(axis=0) for part in parts]), parts[0].shape[1])
+                  _noise([part[:4] / part[:4].sum(axis=0) for part in parts]), parts[0].shape[1],
+                  side)
 
 
 def _merge(grid: NDArray, size: int) -> NDArray:

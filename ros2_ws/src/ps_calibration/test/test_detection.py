@@ -11,11 +11,11 @@ from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.stack import Stack, angular_error_deg
 
 
-def test_dots_are_found_to_a_fiftieth_of_a_pixel(
+def test_dots_are_found_to_a_hundredth_of_a_pixel(
         stack: Stack, bench: Bench, target: RingTarget) -> None:
     truth = project(stack.camera, bench.where.position + target.dots @ bench.where.rotation.T)
     found = find_dots(np.sum(stack.images[:4], axis=0, dtype=np.float32), target, stack.camera)
-    assert np.abs(found - truth).max() < 0.02
+    assert np.abs(found - truth).max() < 0.01
 
 
 def test_pose_follows_from_the_dots(stack: Stack, bench: Bench, target: RingTarget) -> None:

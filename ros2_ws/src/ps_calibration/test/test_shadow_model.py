@@ -1,11 +1,13 @@
 """Soft shadows of the model against brute force and against the light model."""
+from dataclasses import replace
 import math
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ps_calibration.ring_target import RingTarget
-from ps_calibration.shadow_model import plate_irradiance
+from ps_calibration.shadow_model import light_and_rates, plate_irradiance
 from ps_head_driver.head_model import HeadModel
 from ps_head_driver.kinematics import BrightFieldKinematics, PanelPose
 from ps_head_driver.light_model import light_vectors
@@ -54,3 +56,32 @@ def test_shadow_equals_brute_force(panel: PanelPose, target: RingTarget) -> None
     assert shaded.sum() > 15
     assert np.abs(error).max() < 0.03
     assert abs(error[shaded].mean()) < 0.003
+
+
+@pytest.mark.parametrize('lobe', [1.0, 2.5])
+def test_derivatives_are_those_of_the_light(
+        panel: PanelPose, target: RingTarget, lobe: float) -> None:
+    points = np.random.default_rng(3).uniform(-0.016, 0.016, (400, 2))
+    points = points[target.distance(*points.T) > 0.0006]
+    # no direction may be special
+    tilted = Rotation.from_rotvec([0.01, 0.02, 0.03])
+    panel = replace(panel, lobe_exponent=lobe, axis=tilted.apply(panel.axis),
+                    right=tilted.apply(panel.right))
+
+    def light(moved: PanelPose) -> np.ndarray:
+        return plate_irradiance(points, moved, target.height, target.footprint)
+
+    found, rates = light_and_rates(points, panel, target.height, target.footprint)
+    assert found == pytest.approx(light(panel), rel=1e-12)
+    for k in range(6):
+        step = (1e-5 if k < 3 else 1e-4) * np.eye(3)[k % 3]
+        ends = []
+        for way in (step, -step):
+            turn = Rotation.from_rotvec(way)
+            ends.append(light(replace(panel, center=panel.center + way) if k < 3 else replace(
+                panel, axis=turn.apply(panel.axis), right=turn.apply(panel.right))))
+        expected = (ends[0] - ends[1]) / (2 * step.sum())
+        # a few points where the quadrature changes its parts may be off
+        error = np.abs(rates[:, k] - expected) / np.abs(expected).max()
+        assert np.quantile(error, 0.97) < 2e-3
+        assert error.max() < 0.1

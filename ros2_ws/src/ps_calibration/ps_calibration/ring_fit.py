@@ -296,7 +296,8 @@ def _summary(problem: _Problem, x: NDArray, jacobian: NDArray) -> RingFit:
         first = last
     panels = x[:4 * PER_PANEL].reshape(4, PER_PANEL).copy()
     lengths = np.linalg.norm(jacobian, axis=0)
-    strengths = np.linalg.svd(jacobian / np.maximum(lengths, 1e-300), compute_uv=False)
+    scaled = jacobian / np.maximum(lengths, 1e-300)
+    strengths = np.sqrt(np.linalg.eigvalsh(scaled.T @ scaled)[::-1].clip(min=1e-30))
     return RingFit(panels, [problem.tilt(x, k) for k in range(len(lights))], problem.pose(x),
                    problem.height(x), residuals, edge_px, scatter,
                    deviation[:4 * PER_PANEL].reshape(4, PER_PANEL),

@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ps_calibration.before_after import relit
-from ps_calibration.ring_fit import RingFit, Shares, corrected, predicted_shares
+from ps_calibration.ring_fit import RingFit, corrected, predicted_shares
 from ps_calibration.ring_target import RingTarget
 from ps_calibration.shadow_maps import with_wall
+from ps_calibration.shares import Shares
 from ps_head_driver.calibration_file import HeadCalibration
 from ps_head_driver.camera_model import plane_points
 from ps_head_driver.head_model import CameraGeometry, HeadModel

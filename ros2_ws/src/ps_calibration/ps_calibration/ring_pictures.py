@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ps_calibration.detection import find_dots
-from ps_calibration.ring_fit import Shares
 from ps_calibration.ring_target import RingTarget
+from ps_calibration.shares import Shares
 from ps_calibration.target_pose import TargetPose, fit_pose
 from ps_head_driver.camera_model import scaled_camera
 from ps_head_driver.errors import ErrorCode, PsError

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from ps_calibration.ring_fit import RingFit, Shares, corrected, predicted_shares
+from ps_calibration.ring_fit import RingFit, corrected, predicted_shares
 from ps_calibration.ring_target import RingTarget
+from ps_calibration.shares import Shares
 from ps_head_driver.camera_model import project
 from ps_head_driver.head_model import CameraGeometry, HeadModel
 

@@ -39,8 +39,8 @@ class Shares:
     pixels: NDArray
     values: NDArray
     noise: NDArray
-    near: int
-    block_px: int
+    near: int = 0
+    block_px: int = 1
 
     def thinned(self, part: int) -> 'Shares':
         """One block in ``part``."""

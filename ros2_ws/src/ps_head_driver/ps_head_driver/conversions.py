@@ -5,7 +5,6 @@ import math
 from typing import Any, TypeVar
 
 from builtin_interfaces.msg import Time
-import cv2
 from geometry_msgs.msg import Point, PoseStamped, Quaternion, TransformStamped, Vector3
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,18 @@ from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.frames import OPTICAL_FRAME, PLANE_FRAME
 from ps_head_driver.head_frames import Transform, static_transforms
 from ps_head_driver.head_model import CameraGeometry, HeadModel
-from ps_head_driver.stack import Geometry, Light, Mode, Panel, Plane, Pose, Stack, Vector
+from ps_head_driver.pixel_formats import demosaic
+from ps_head_driver.stack import (
+    Geometry,
+    Light,
+    Mode,
+    Panel,
+    Plane,
+    Pose,
+    Stack,
+    Vector,
+    with_exposure_scale,
+)
 from ps_interfaces import msg as ps
 
 T = TypeVar('T')
@@ -29,9 +39,6 @@ ENCODINGS: dict[str, tuple[str, int]] = {
     **{f'bayer_{order}{bits}': (f'u{bits // 8}', 1)
        for order in ('rggb', 'bggr', 'gbrg', 'grbg') for bits in (8, 16)},
 }
-# OpenCV names a Bayer pattern by its second row, ROS by its first
-_BAYER = {'rggb': cv2.COLOR_BayerBG2RGB, 'bggr': cv2.COLOR_BayerRG2RGB,
-          'gbrg': cv2.COLOR_BayerGR2RGB, 'grbg': cv2.COLOR_BayerGB2RGB}
 
 
 # ---------------------------------------------------------------------------- images
@@ -89,7 +96,7 @@ def message_to_image(message: Image) -> NDArray:
     if message.encoding.startswith('bgr'):
         return image[..., ::-1]
     if message.encoding.startswith('bayer'):
-        return cv2.cvtColor(image, _BAYER[message.encoding[6:10]])
+        return demosaic(image, message.encoding[6:10])
     return image
 
 
@@ -187,14 +194,6 @@ def message_to_light(message: ps.LightState) -> Light:
         frame_counter=message.frame_counter, device_time_ns=message.device_time_ns)
 
 
-def exposure(light: Light) -> float:
-    """Light collected per unit irradiance: the strobe as far as the shutter is open, times the
-    gain.
-    """
-    times = [t for t in (light.strobe_duration, light.exposure_time) if t > 0]
-    return (min(times) if times else 1.0) * 10 ** (light.gain / 20)
-
-
 # ---------------------------------------------------------------------------- the stack
 
 def stack_to_message(stack: Stack) -> ps.PhotometricStack:
@@ -259,15 +258,6 @@ def message_to_stack(message: ps.PhotometricStack) -> Stack:
         calibration_id=message.calibration_id, flat_id=message.flat_id,
         stamp_ns=time_to_ns(message.header.stamp), head_pose=message_to_pose(pose),
         convergence_radius=message.convergence_radius, light_height=message.light_height)
-
-
-def with_exposure_scale(lights: list[Light]) -> list[Light]:
-    """Set ``exposure_scale`` of every light relative to the longest exposure of the stack."""
-    from dataclasses import replace
-    exposures = [exposure(light) for light in lights]
-    longest = max(exposures)
-    return [replace(light, exposure_scale=own / longest)
-            for light, own in zip(lights, exposures, strict=True)]
 
 
 def pose_to_message(pose: Pose) -> PoseStamped:

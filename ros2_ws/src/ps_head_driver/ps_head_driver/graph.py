@@ -83,8 +83,8 @@ _HANDED_ON = {argument.name: argument for argument in (
     Argument('port', '', 'serial port of the head'),
     Argument('head_file', '', 'description of the head (YAML)'),
     Argument('camera', '', 'camera back end: fake renders what the emulated head lights, folder '
-             'plays pictures from input_folder, topic uses any ROS camera driver',
-             ('', 'fake', 'folder', 'topic')),
+             'plays pictures from input_folder, topic uses any ROS camera driver, genicam a GigE '
+             'or USB3 Vision camera', ('', 'fake', 'folder', 'topic', 'genicam')),
     Argument('input_folder', '', 'stack or four-direction folder that camera:=folder plays'),
     Argument('scene', '', 'scene that camera:=fake renders'),
     Argument('calibration_file', '', 'head calibration that is active from the start'),

@@ -196,6 +196,13 @@ def call(client: Client, request: Any, timeout: float, code: ErrorCode) -> Any:
     return response
 
 
+def wait_for_future(future: Any, timeout: float) -> Any:
+    """Result of an rclpy future that another thread spins for; None after ``timeout`` seconds."""
+    done = threading.Event()
+    future.add_done_callback(lambda _: done.set())
+    return future.result() if done.wait(timeout) else None
+
+
 # ---------------------------------------------------------------------------- diagnostics
 
 OK, WARN, ERROR, STALE = (

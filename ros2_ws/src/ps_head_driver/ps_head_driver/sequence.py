@@ -4,130 +4,69 @@ A frame is given to a light by counters and device times, never by the order of 
 is assembled whole and right, or not at all.
 """
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import groupby
-from pathlib import Path
-from typing import Annotated, Literal
-
-import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from ps_head_driver.cameras.base import Frame
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_head_driver.head_model import parse_yaml, read_yaml
+from ps_head_driver.recipes import Recipe, Step
 from ps_head_driver.stack import Light, Mode, Panel
-
-ModeName = Literal['BRIGHT_FIELD', 'DARK_FIELD', 'BOTH']
-PanelName = Literal['E', 'N', 'W', 'S', 'ALL', 'NONE']
-
-
-# ---------------------------------------------------------------------------- recipes
-
-class Step(BaseModel):
-    """One light of a recipe."""
-
-    model_config = ConfigDict(extra='forbid', frozen=True, allow_inf_nan=False)
-
-    mode: ModeName = 'BRIGHT_FIELD'
-    panel: PanelName
-    convergence_radius: Annotated[float, Field(ge=0)] = 0.0     # m; 0: stay where the head is
-    exposure: Annotated[float, Field(ge=0, le=10)] = 0.0        # s; 0: the recipe's
-    intensity: Annotated[float, Field(ge=0, le=1)] = 1.0        # relative
-
-
-class Recipe(BaseModel):
-    """What one capture consists of."""
-
-    model_config = ConfigDict(extra='forbid', frozen=True, allow_inf_nan=False)
-
-    steps: Annotated[list[Step], Field(min_length=1, max_length=32)]
-    exposure: Annotated[float, Field(ge=0, le=10)] = 0.0        # s; 0: the node's default
-    ambient: bool = False                                       # one more frame, all panels off
-
-    @model_validator(mode='after')
-    def _one_exposure_with_ambient(self) -> 'Recipe':
-        if self.ambient and len({self.exposure_of(step, 1.0) for step in self.steps}) > 1:
-            raise ValueError('ambient: all steps need the same exposure, because the ambient '
-                             'frame is subtracted from each')
-        return self
-
-    def exposure_of(self, step: Step, default: float) -> float:
-        """Exposure of one step in seconds: its own, else the recipe's, else the default."""
-        return step.exposure or self.exposure or default
-
-
-class Recipes(BaseModel):
-    """A recipe file: named recipes and which one is the default."""
-
-    model_config = ConfigDict(extra='forbid', frozen=True)
-
-    default: str
-    recipes: dict[str, Recipe]
-
-    @model_validator(mode='after')
-    def _default_exists(self) -> 'Recipes':
-        if self.default not in self.recipes:
-            raise ValueError(f'default: there is no recipe {self.default!r}')
-        return self
-
-    def get(self, name: str) -> Recipe:
-        """The named recipe, or the default for an empty name.
-
-        :raises PsError: SEQUENCER_UNKNOWN_RECIPE with the names there are.
-        """
-        recipe = self.recipes.get(name or self.default)
-        if recipe is None:
-            raise PsError(ErrorCode.SEQUENCER_UNKNOWN_RECIPE,
-                          f'recipe {name!r} is not in the recipe file; it has '
-                          + ', '.join(sorted(self.recipes)))
-        return recipe
-
-
-def load_recipes(path: str | Path) -> Recipes:
-    """Read a recipe file.
-
-    :raises PsError: SEQUENCER_BAD_REQUEST naming file and field.
-    """
-    code = ErrorCode.SEQUENCER_BAD_REQUEST
-    recipes: Recipes = parse_yaml(Recipes, read_yaml(path, code), str(path), code)
-    return recipes
-
 
 # ---------------------------------------------------------------------------- plan
 
 @dataclass(frozen=True)
 class Shot:
-    """One triggered frame to take."""
+    """One triggered frame to take.
 
+    :param light: place of its light in the stack; the frames of a bracket share it.
+    :param exposure: s.
+    :param gain: dB.
+    """
+
+    light: int
     mode: Mode
     panel: Panel
     intensity: float
-    exposure: float        # s
+    exposure: float
+    gain: float
 
 
 @dataclass(frozen=True)
-class Segment:
-    """Shots at one position of the panels: one strobe program."""
+class Program:
+    """Shots that the board takes in one go: one position of the panels, one camera setting."""
 
     convergence_radius: float     # m; 0: stay where the head is
     shots: tuple[Shot, ...]
 
 
-def plan(recipe: Recipe, default_exposure: float) -> list[Segment]:
-    """Split a recipe into strobe programs, one for each run of steps at the same CR.
+def plan(recipe: Recipe, default_exposure: float, default_gain: float = 0.0) -> list[Program]:
+    """Split a recipe into strobe programs.
+
+    A new program begins where CR changes, and where exposure or gain do: a camera cannot change
+    them between two triggers of a running program. An ambient frame comes last.
 
     :param default_exposure: for steps and recipes that state none, s.
+    :param default_gain: for steps that state none, dB.
     """
-    segments = [
-        Segment(radius, tuple(
-            Shot(Mode[step.mode], Panel[step.panel], step.intensity,
-                 recipe.exposure_of(step, default_exposure)) for step in steps))
-        for radius, steps in groupby(recipe.steps, key=lambda step: step.convergence_radius)]
+    steps = list(recipe.steps)
     if recipe.ambient:
-        last = segments[-1]
-        ambient = Shot(Mode.BRIGHT_FIELD, Panel.NONE, 0.0, last.shots[-1].exposure)
-        segments[-1] = replace(last, shots=(*last.shots, ambient))
-    return segments
+        steps.append(steps[-1].model_copy(
+            update={'mode': 'BRIGHT_FIELD', 'panel': 'NONE', 'intensity': 0.0}))
+
+    def shot(light: int, step: Step, factor: float) -> Shot:
+        return Shot(light, Mode[step.mode], Panel[step.panel], step.intensity,
+                    factor * recipe.exposure_of(step, default_exposure),
+                    step.gain or default_gain)
+
+    programs = []
+    for radius, here in groupby(enumerate(steps), key=lambda item: item[1].convergence_radius):
+        group = list(here)
+        shots = [shot(*item, factor) for factor in sorted(recipe.bracket or [1.0])
+                 for item in group]
+        for _, same in groupby(shots, key=lambda one: (one.exposure, one.gain)):
+            programs.append(Program(radius, tuple(same)))
+            radius = 0.0      # the next ones find the head there
+    return programs
 
 
 # ---------------------------------------------------------------------------- match
@@ -193,26 +132,3 @@ def check_images(frames: Sequence[Frame]) -> None:
             raise PsError(ErrorCode.SEQUENCER_BAD_IMAGE,
                           f'frame {i + 1} is {frame.image.shape} {frame.image.dtype}, the first '
                           f'is {first.shape} {first.dtype}')
-
-
-# ---------------------------------------------------------------------------- flat field
-
-def gain_map(images: Sequence[np.ndarray], ambient: np.ndarray | None, height: int) -> np.ndarray:
-    """Mean of several flat-field pictures at reduced resolution.
-
-    :param images: (H, W) or (H, W, 3), of one light.
-    :param ambient: all panels off, or None.
-    :param height: rows of the result; the width follows.
-    :returns: (height, width) float32, in the unit of the pictures, at least 1/1000 of its maximum.
-    """
-    import cv2
-    stacked = np.stack([np.asarray(image, np.float32) for image in images])
-    mean = np.asarray(stacked.mean(axis=0), np.float32)
-    if ambient is not None:
-        mean = mean - ambient.astype(np.float32)
-    if mean.ndim == 3:
-        mean = np.asarray(mean.mean(axis=2), np.float32)
-    height = min(height, mean.shape[0])
-    width = max(1, round(mean.shape[1] * height / mean.shape[0]))
-    small = cv2.resize(mean, (width, height), interpolation=cv2.INTER_AREA)
-    return np.maximum(small, small.max() * 1e-3).astype(np.float32)

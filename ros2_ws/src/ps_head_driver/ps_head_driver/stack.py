@@ -3,6 +3,7 @@
 Mirrors ps_interfaces/PhotometricStack; conversions.py converts between the two, stack_folder.py
 reads and writes it as files.
 """
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
@@ -74,6 +75,22 @@ class Light:
         """Whether the frame is one photometric equation: exactly one panel lit it."""
         return self.distant or (
             self.panel in (Panel.E, Panel.N, Panel.W, Panel.S) and self.mode != Mode.BOTH)
+
+
+def exposure(light: Light) -> float:
+    """Light collected per unit irradiance: the strobe as far as the shutter is open, times the
+    gain.
+    """
+    times = [t for t in (light.strobe_duration, light.exposure_time) if t > 0]
+    return (min(times) if times else 1.0) * 10 ** (light.gain / 20)
+
+
+def with_exposure_scale(lights: Sequence[Light]) -> list[Light]:
+    """Set ``exposure_scale`` of every light relative to the longest exposure of the stack."""
+    exposures = [exposure(light) for light in lights]
+    longest = max(exposures)
+    return [replace(light, exposure_scale=own / longest)
+            for light, own in zip(lights, exposures, strict=True)]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,17 @@ pytest.importorskip('ps_interfaces.msg', reason='needs the built workspace (make
 from ps_head_driver import conversions as convert
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import load_head, nominal_head_path
-from ps_head_driver.stack import Geometry, Light, Mode, Panel, Plane, Pose, Stack
+from ps_head_driver.stack import (
+    Geometry,
+    Light,
+    Mode,
+    Panel,
+    Plane,
+    Pose,
+    Stack,
+    exposure,
+    with_exposure_scale,
+)
 
 pixels = st.sampled_from([(np.uint8, 0), (np.uint16, 0), (np.uint8, 3), (np.uint16, 3),
                           (np.float32, 0), (np.float32, 2), (np.float32, 3)])
@@ -93,7 +103,7 @@ def stack() -> Stack:
         for i, panel in enumerate([Panel.E, Panel.N, Panel.W, Panel.S])]
     return Stack(
         images=[rng.integers(0, 255, **frame) for _ in lights],
-        lights=convert.with_exposure_scale(lights),
+        lights=with_exposure_scale(lights),
         camera=load_head(nominal_head_path()).camera, ambient=rng.integers(0, 9, **frame),
         mask=rng.random((6, 8)) > 0.5,
         gain_maps=[rng.random((3, 4)).astype(np.float32) for _ in lights],
@@ -117,9 +127,9 @@ def test_stack_round_trip():
 
 
 def test_strobe_counts_only_while_the_shutter_is_open_and_gain_multiplies():
-    assert convert.exposure(Light(strobe_duration=0.02, exposure_time=0.01)) == 0.01
-    assert convert.exposure(Light(strobe_duration=0.002, exposure_time=0.01)) == 0.002
-    assert convert.exposure(Light(exposure_time=0.01, gain=20.0)) == pytest.approx(0.1)
+    assert exposure(Light(strobe_duration=0.02, exposure_time=0.01)) == 0.01
+    assert exposure(Light(strobe_duration=0.002, exposure_time=0.01)) == 0.002
+    assert exposure(Light(exposure_time=0.01, gain=20.0)) == pytest.approx(0.1)
 
 
 

@@ -1,20 +1,16 @@
-"""Recipes become programs, and frames are given to lights by counters and times or not at all."""
+"""Frames are given to lights by counters and times, or not at all."""
 from dataclasses import replace
-from pathlib import Path
 import random
 
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
-import yaml
 
 from ps_head_driver import sequence
 from ps_head_driver.cameras.base import Frame
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_head_driver.stack import Light, Mode, Panel
-
-SHIPPED = Path(__file__).resolve().parents[1] / 'config' / 'recipes.yaml'
+from ps_head_driver.stack import Light
 
 
 def exposures(count=4, first_strobe=11, first_frame=3, period_s=0.017):
@@ -96,67 +92,3 @@ def test_frames_of_different_size_are_refused():
     with pytest.raises(PsError, match='frame 4') as error:
         sequence.check_images(frames)
     assert error.value.code == ErrorCode.SEQUENCER_BAD_IMAGE
-
-
-# ---------------------------------------------------------------------------- recipes
-
-def test_shipped_recipes_are_the_four_views():
-    recipe = sequence.load_recipes(SHIPPED).get('')
-    (segment,) = sequence.plan(recipe, 0.004)
-    assert [shot.panel for shot in segment.shots] == [Panel.E, Panel.N, Panel.W, Panel.S]
-    assert {shot.mode for shot in segment.shots} == {Mode.BRIGHT_FIELD}
-    assert {shot.exposure for shot in segment.shots} == {0.004}
-
-
-def test_steps_at_one_cr_form_one_program_and_ambient_comes_last():
-    recipe = sequence.Recipe.model_validate({'ambient': True, 'exposure': 0.01, 'steps': [
-        {'panel': 'E', 'convergence_radius': 0.06}, {'panel': 'W', 'convergence_radius': 0.06},
-        {'panel': 'E', 'convergence_radius': 0.02}]})
-    first, second = sequence.plan(recipe, 0.004)
-    assert (first.convergence_radius, len(first.shots)) == (0.06, 2)
-    assert (second.convergence_radius, len(second.shots)) == (0.02, 2)
-    assert second.shots[-1].panel is Panel.NONE
-    assert second.shots[-1].exposure == 0.01
-
-
-@pytest.mark.parametrize(('change', 'named'), [
-    ({'default': 'nothing'}, 'nothing'),
-    ({'recipes': {'a': {'steps': []}}}, 'recipes.a.steps'),
-    ({'recipes': {'a': {'steps': [{'panel': 'NE'}]}}}, 'panel'),
-    ({'recipes': {'a': {'steps': [{'panel': 'E', 'exposure': -1}]}}}, 'exposure'),
-    ({'recipes': {'a': {'steps': [{'panel': 'E', 'colour': 1}]}}}, 'colour'),
-    ({'recipes': {'a': {'ambient': True, 'steps': [
-        {'panel': 'E', 'exposure': 0.1}, {'panel': 'W', 'exposure': 0.2}]}}}, 'same exposure'),
-])
-def test_wrong_recipe_file_is_refused_with_the_field(tmp_path, change, named):
-    content = {'default': 'a', 'recipes': {'a': {'steps': [{'panel': 'E'}]}}} | change
-    path = tmp_path / 'recipes.yaml'
-    path.write_text(yaml.safe_dump(content))
-    with pytest.raises(PsError, match=named) as error:
-        sequence.load_recipes(path)
-    assert error.value.code == ErrorCode.SEQUENCER_BAD_REQUEST
-    assert 'recipes.yaml' in error.value.message
-
-
-def test_unknown_recipe_says_which_there_are():
-    with pytest.raises(PsError, match='bright_field, ') as error:
-        sequence.load_recipes(SHIPPED).get('matt')
-    assert error.value.code == ErrorCode.SEQUENCER_UNKNOWN_RECIPE
-
-
-# ---------------------------------------------------------------------------- flat field
-
-def test_gain_map_is_the_mean_without_ambient_at_reduced_size():
-    rng = np.random.default_rng(0)
-    truth = np.linspace(50, 150, 64)[None, :].repeat(48, 0)
-    images = [(truth + 20 + rng.normal(0, 2, truth.shape)).astype(np.uint8) for _ in range(8)]
-    gain = sequence.gain_map(images, np.full(truth.shape, 20, np.uint8), 12)
-    assert gain.shape == (12, 16)
-    assert gain.dtype == np.float32
-    np.testing.assert_allclose(gain, truth.reshape(12, 4, 16, 4).mean((1, 3)), atol=1.0)
-
-
-def test_gain_map_of_a_dark_corner_stays_positive():
-    image = np.zeros((32, 32), np.uint8)
-    image[:16] = 200
-    assert sequence.gain_map([image], None, 8).min() > 0

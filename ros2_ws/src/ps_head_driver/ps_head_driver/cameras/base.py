@@ -36,8 +36,9 @@ class Frame:
 
 
 class Camera(ABC):
-    """A camera that takes one picture for each trigger pulse.
+    """A camera that takes one picture for each trigger.
 
+    The trigger is a pulse from the board, or :meth:`trigger` where the host steps the sequence.
     Use: open, then for each strobe program arm, collect; close. One thread does this;
     :meth:`cancel` may come from another.
     """
@@ -68,13 +69,21 @@ class Camera(ABC):
 
     @abstractmethod
     def arm(self, exposures: Sequence[float], panels: Sequence[Light] | None = None,
-            gain: float = 0.0) -> None:
+            gain: float = 0.0, software_trigger: bool = False) -> None:
         """Forget old frames and get ready for one triggered frame per exposure time.
 
         :param exposures: s, in the order of the triggers.
         :param panels: what lights each frame, same length; only the folder camera looks at it.
         :param gain: dB.
+        :param software_trigger: wait for :meth:`trigger` and not for the board's pulses.
         :raises PsError: SEQUENCER_CAMERA_LOST, or SEQUENCER_BAD_REQUEST.
+        """
+
+    @abstractmethod
+    def trigger(self) -> None:
+        """Take a picture now; the camera is armed with ``software_trigger``.
+
+        :raises PsError: SEQUENCER_CAMERA_LOST.
         """
 
     @abstractmethod

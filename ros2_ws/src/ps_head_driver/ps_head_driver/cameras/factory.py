@@ -7,7 +7,7 @@ from ps_head_driver.cameras.base import Camera
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import HeadModel, load_head
 
-CAMERAS = ('fake', 'folder', 'topic')
+CAMERAS = ('fake', 'folder', 'topic', 'genicam')
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,11 @@ def make_camera(name: str, settings: CameraSettings) -> Camera:
     if name == 'topic':
         from ps_head_driver.cameras.topic import TopicCamera
         return TopicCamera(settings.node, parameters['image_topic'],
-                           settings.head.camera.camera_standoff)
+                           settings.head.camera.camera_standoff,
+                           parameters['significant_bits'])
+    if name == 'genicam':
+        from ps_head_driver.cameras.genicam import GenicamCamera
+        return GenicamCamera(parameters['camera_id'], parameters['trigger_line'],
+                             parameters['pixel_format'])
     raise PsError(ErrorCode.SEQUENCER_BAD_REQUEST,
                   f'parameter camera: {name!r} is not one of {", ".join(CAMERAS)}')

@@ -33,6 +33,18 @@ class FrameFaults:
     delay: dict[int, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class _Exposure:
+    """One exposure: index since arming, frame count, s open, s lit of it, dB, start."""
+
+    index: int
+    frame_counter: int
+    exposure: float
+    lit_s: float
+    gain: float
+    host_time_ns: int
+
+
 class FakeCamera(Camera):
     """A camera on the trigger cable of the fake head.
 
@@ -72,6 +84,8 @@ class FakeCamera(Camera):
         self._exposures: list[float] = []
         self._gain = 0.0
         self._armed = self._cancelled = self._rendering = False
+        self._software_trigger = False
+        self._triggered_ns: int | None = None           # host time of a trigger() not yet exposed
         self._error: PsError | None = None
         self._frame_counter = 0
         self._armings = self._exposed = 0
@@ -118,7 +132,7 @@ class FakeCamera(Camera):
         self._listener = self._thread = None
 
     def arm(self, exposures: Sequence[float], panels: Sequence[Light] | None = None,
-            gain: float = 0.0) -> None:
+            gain: float = 0.0, software_trigger: bool = False) -> None:
         """Forget old frames; every trigger from now on is exposed."""
         listener = self._listener
         if listener is None or not listener.wait_connected(_CONNECT_TIMEOUT_S):
@@ -132,6 +146,12 @@ class FakeCamera(Camera):
             self._armings += 1
             self._exposed, self._first, self._last_device_ns = 0, None, None
             self._armed, self._cancelled = True, False
+            self._software_trigger, self._triggered_ns = software_trigger, None
+
+    def trigger(self) -> None:
+        """Expose from now on; the picture is rendered when the light's end is known."""
+        with self._changed:
+            self._triggered_ns = time.time_ns()
 
     def collect(self, count: int, timeout: float) -> list[Frame]:
         """See Camera; the timeout runs while nothing is being rendered."""
@@ -174,10 +194,8 @@ class FakeCamera(Camera):
                 self._rendering = exposed is not None
             if exposed is None:
                 continue
-            index, frame_counter, exposure, gain, host_time_ns = exposed
             try:
-                frame = self._render(event, frame_counter, exposure, gain, host_time_ns)
-                self._deliver(arming, index, frame)
+                self._deliver(arming, exposed.index, self._render(event, exposed))
             except Exception as error:
                 with self._changed:
                     self._error = error if isinstance(error, PsError) else PsError(
@@ -188,34 +206,45 @@ class FakeCamera(Camera):
                     self._progress_s = time.monotonic()
                     self._changed.notify_all()
 
-    def _expose(self, event: StrobeEvent) -> tuple[int, int, float, float, int] | None:
-        """Take the trigger: index since arming, frame counter, exposure, gain, host time."""
+    def _expose(self, event: StrobeEvent) -> '_Exposure | None':
+        """Take the trigger, if there is one for this strobe."""
         trigger = (event.boot, event.trigger_counter)
         triggered = event.trigger_counter > 0 and trigger != self._last_trigger
         self._last_trigger = trigger
+        if self._software_trigger:
+            triggered = self._triggered_ns is not None
         if not (self._armed and triggered):
             return None
         last = self._last_device_ns
         if last is not None and 0 <= event.device_time_ns - last < self._shortest_ns:
             return None
         self._last_device_ns = event.device_time_ns
-        if self._first is None:
-            # the event comes at the end of the strobe; later ones may wait for the renderer
-            self._first = (event.device_time_ns, time.time_ns() - int(event.strobe_s * 1e9))
-        host_time_ns = self._first[1] + event.device_time_ns - self._first[0]
         exposure = self._exposures[min(self._exposed, len(self._exposures) - 1)]
+        # the event comes at the end of the strobe
+        begun_ns = time.time_ns() - int(event.strobe_s * 1e9)
+        lit_s = event.strobe_s
+        if self._triggered_ns is not None:
+            host_time_ns, self._triggered_ns = self._triggered_ns, None
+            lit_s = max(lit_s - max(host_time_ns - begun_ns, 0) * 1e-9, 0.0)
+        else:
+            if self._first is None:      # later events may have waited for the renderer
+                self._first = (event.device_time_ns, begun_ns)
+            host_time_ns = self._first[1] + event.device_time_ns - self._first[0]
         self._exposed += 1
         self._frame_counter += 1
-        return self._exposed, self._frame_counter, exposure, self._gain, host_time_ns
+        return _Exposure(self._exposed, self._frame_counter, exposure, lit_s, self._gain,
+                         host_time_ns)
 
-    def _render(self, event: StrobeEvent, frame_counter: int, exposure: float, gain: float,
-                host_time_ns: int) -> Frame:
+    def _render(self, event: StrobeEvent, exposed: '_Exposure') -> Frame:
         image = self.renderer.render(
-            event.tilt, event.df_tilt, event.bf_levels, event.df_levels, exposure, event.strobe_s,
-            gain, frame_counter)
-        return Frame(image=image, frame_counter=frame_counter,
-                     trigger_counter=event.trigger_counter, device_time_ns=event.device_time_ns,
-                     host_time_ns=host_time_ns, exposure_time=exposure, gain=gain)
+            event.tilt, event.df_tilt, event.bf_levels, event.df_levels, exposed.exposure,
+            exposed.lit_s, exposed.gain, exposed.frame_counter)
+        by_board = not self._software_trigger
+        return Frame(image=image, frame_counter=exposed.frame_counter,
+                     trigger_counter=event.trigger_counter if by_board else None,
+                     device_time_ns=event.device_time_ns if by_board else None,
+                     host_time_ns=exposed.host_time_ns, exposure_time=exposed.exposure,
+                     gain=exposed.gain)
 
     def _deliver(self, arming: int, index: int, frame: Frame) -> None:
         if index in self.faults.delay:

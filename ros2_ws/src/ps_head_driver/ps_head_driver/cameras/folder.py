@@ -56,7 +56,7 @@ class FolderCamera(Camera):
         return self._stack
 
     def arm(self, exposures: Sequence[float], panels: Sequence[Light] | None = None,
-            gain: float = 0.0) -> None:
+            gain: float = 0.0, software_trigger: bool = False) -> None:
         """Choose the pictures of the given panels, or the first ones if none are given.
 
         :raises PsError: SEQUENCER_BAD_REQUEST if the folder lacks a picture; names those it has.
@@ -78,6 +78,9 @@ class FolderCamera(Camera):
             self._frames.append(Frame(
                 image=image, frame_counter=self._frame_counter, trigger_counter=None,
                 device_time_ns=None, host_time_ns=now, exposure_time=exposure, gain=gain))
+
+    def trigger(self) -> None:
+        """Nothing to do: the picture is there."""
 
     def collect(self, count: int, timeout: float) -> list[Frame]:
         """All frames of the armed sequence; they need no waiting."""

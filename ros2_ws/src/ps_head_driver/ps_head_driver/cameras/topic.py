@@ -1,6 +1,7 @@
 """Topic camera: any ROS camera driver that is triggered by the board and stamps its frames."""
 from collections.abc import Sequence
 import threading
+import time
 
 import numpy as np
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -12,29 +13,38 @@ from ps_head_driver.cameras.base import Camera, Frame, Light
 from ps_head_driver.conversions import message_to_camera, message_to_image, time_to_ns
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import CameraGeometry
+from ps_head_driver.pixel_formats import use_all_bits
 from ps_head_driver.ros_support import OVERRIDABLE
 
 
 class TopicCamera(Camera):
     """Collects the pictures that a camera driver publishes while it is armed.
 
-    The driver must run the camera in hardware-trigger mode with the exposure that the recipe
-    states, and stamp every picture with the start of its exposure: the stamps are what frames are
-    matched by. A camera_info topic beside the image topic is used if there is one.
+    The driver must run the camera with the exposure that the recipe states, and stamp every
+    picture with the start of its exposure: the stamps are what frames are matched by. It runs the
+    camera in hardware-trigger mode, or, where the host steps the sequence, freely: then the first
+    picture is taken that was begun, by its stamp on this host's clock, after the trigger.
+    A camera_info topic beside the image topic is used if there is one.
 
     :param node: subscribes on it.
     :param topic: of the pictures; camera_info is looked for beside it.
     :param standoff: camera centre above the origin of ps_head_plane, m.
+    :param significant_bits: of 16-bit pictures whose driver fills in the lowest bits only: 12 for
+        values up to 4095. They are shifted up, so that full scale is full scale.
     """
 
-    def __init__(self, node: Node, topic: str, standoff: float) -> None:
+    def __init__(self, node: Node, topic: str, standoff: float,
+                 significant_bits: int = 16) -> None:
         self._node, self._topic, self._standoff = node, topic, standoff
+        self._bits = significant_bits
         self._arrived = threading.Condition()
         self._frames: list[Frame] = []
         self._exposures: list[float] = []
         self._gain = 0.0
         self._counter = 0
         self._armed = self._cancelled = False
+        self._software_trigger = False
+        self._not_before_ns: int | None = None      # None: no picture counts before trigger()
         self._error: PsError | None = None
         self._geometry: CameraGeometry | None = None
         self._subscriptions: list = []
@@ -74,22 +84,27 @@ class TopicCamera(Camera):
         with self._arrived:
             index, stamp_ns = len(self._frames), time_to_ns(message.header.stamp)
             self._counter += 1
-            if not self._armed:
+            if not self._armed or self._not_before_ns is None or stamp_ns < self._not_before_ns:
                 return
             try:
-                image = np.array(message_to_image(message))
+                image = use_all_bits(np.array(message_to_image(message)), self._bits)
             except PsError as error:
                 self._error = error
+            except ValueError as error:
+                self._error = PsError(ErrorCode.SEQUENCER_BAD_IMAGE,
+                                      f'{error}; parameter significant_bits does not fit')
             else:
                 exposure = self._exposures[min(index, len(self._exposures) - 1)]
                 self._frames.append(Frame(
                     image=image, frame_counter=self._counter, trigger_counter=None,
                     device_time_ns=stamp_ns, host_time_ns=stamp_ns,
                     exposure_time=exposure, gain=self._gain))
+                if self._software_trigger:
+                    self._not_before_ns = None
             self._arrived.notify_all()
 
     def arm(self, exposures: Sequence[float], panels: Sequence[Light] | None = None,
-            gain: float = 0.0) -> None:
+            gain: float = 0.0, software_trigger: bool = False) -> None:
         """Forget what came before and keep what comes from now on.
 
         :raises PsError: SEQUENCER_CAMERA_LOST if nobody publishes the topic.
@@ -102,6 +117,13 @@ class TopicCamera(Camera):
             self._frames, self._error = [], None
             self._exposures, self._gain = list(exposures), gain
             self._armed, self._cancelled = True, False
+            self._software_trigger = software_trigger
+            self._not_before_ns = None if software_trigger else 0
+
+    def trigger(self) -> None:
+        """Let the first picture count that is begun from now on."""
+        with self._arrived:
+            self._not_before_ns = time.time_ns()
 
     def collect(self, count: int, timeout: float) -> list[Frame]:
         """The pictures that came since arming, in order of arrival; waits for ``count`` of them.

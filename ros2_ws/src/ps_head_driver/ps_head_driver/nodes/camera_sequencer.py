@@ -1,7 +1,7 @@
 """Node camera_sequencer: triggers lights, collects frames, publishes one stack a capture."""
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 from pathlib import Path
 import threading
@@ -9,42 +9,40 @@ import time
 from typing import Any
 import uuid
 
-import numpy as np
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
-from ps_head_driver import convergence_radius, ros_support, sequence
+from ps_head_driver import convergence_radius, ros_support
+from ps_head_driver.acquisition import Acquirer, Acquisition, Progress, Settings, Stage
 from ps_head_driver.calibration_file import HeadCalibration, apply
 from ps_head_driver.camera_model import scaled_camera
-from ps_head_driver.cameras.base import Camera, Frame
+from ps_head_driver.cameras.base import Camera
 from ps_head_driver.cameras.factory import CAMERAS, CameraSettings, make_camera
-from ps_head_driver.conversions import (
-    exposure,
-    message_to_calibration,
-    message_to_light,
-    message_to_pose,
-    stack_to_message,
-    with_exposure_scale,
-)
+from ps_head_driver.conversions import message_to_calibration, message_to_pose, stack_to_message
 from ps_head_driver.errors import ErrorCode, PsError
+from ps_head_driver.flat_field import FlatField, make_flat_field
 from ps_head_driver.frames import OPTICAL_FRAME
 from ps_head_driver.head_model import CameraGeometry, load_head, nominal_head_path
-from ps_head_driver.ros_support import Parameter, answers, call
-from ps_head_driver.stack import Geometry, Light, Panel, Plane, Pose, Stack
+from ps_head_driver.head_services import HeadServices
+from ps_head_driver.recipes import Recipe, load_recipes
+from ps_head_driver.ros_support import Parameter, answers
+from ps_head_driver.stack import Geometry, Panel, Plane, Pose, Stack, with_exposure_scale
 from ps_interfaces import msg as ps
 from ps_interfaces.action import AcquireStack
-from ps_interfaces.srv import Capture, CaptureFlat, RunStrobeProgram, SetIllumination
+from ps_interfaces.srv import Capture, CaptureFlat
 
 PARAMETERS = [
     Parameter('camera', 'fake', 'Camera back end', choices=CAMERAS, read_only=True),
     Parameter('head_file', '', 'Head geometry (YAML); empty: the nominal head', read_only=True),
     Parameter('recipe_file', '', 'Recipes (YAML); empty: the ones shipped', read_only=True),
+    Parameter('sequencing', 'hardware', 'hardware: the board runs the sequence and triggers the '
+              'camera; host: this node does, one light after the other (no trigger cable needed, '
+              'slower)', choices=('hardware', 'host')),
     Parameter('default_exposure', 0.004, 'Exposure of steps that state none', 's', 1e-5, 10.0),
-    Parameter('gain', 0.0, 'Camera gain', 'dB', 0.0, 48.0),
+    Parameter('gain', 0.0, 'Camera gain of steps that state none', 'dB', 0.0, 48.0),
     Parameter('settle', 0.002, 'Panels on before the camera is triggered', 's', 0.0, 1.0),
     Parameter('frame_period', 1 / 60, 'Shortest time between two triggers', 's', 0.001, 10.0),
     Parameter('frame_timeout', 5.0, 'Longest wait for the frames of a finished program', 's',
@@ -54,6 +52,12 @@ PARAMETERS = [
     Parameter('move_timeout', 30.0, 'Longest wait for a move of the panels', 's', 1.0, 300.0),
     Parameter('program_margin', 5.0, 'Longest wait for a strobe program beyond its own duration',
               's', 0.5, 60.0),
+    Parameter('host_margin', 0.2, 'Sequencing host: a light stays on this much longer than the '
+              'exposure', 's', 0.02, 1.5),
+    Parameter('max_motion', 3.0, 'Largest shift between two frames of a stack, measured in them; '
+              'a stack that moved more is refused; 0: none is', 'px', 0.0, 100.0),
+    Parameter('max_motor_motion', 4, 'Largest movement of the panels within a strobe program',
+              'counts', 0, 1000),
     Parameter('flat_height', 256, 'Rows of a stored flat-field picture', 'px', 16, 4096),
     Parameter('trigger_socket', '', 'Fake camera: where the emulator announces strobes; empty: '
               'derived from namespace and domain', read_only=True),
@@ -70,63 +74,31 @@ PARAMETERS = [
     Parameter('slant', math.radians(45), 'Folder camera: assumed slant of lights of unknown '
               'geometry', 'rad', 0.05, 1.5, read_only=True),
     Parameter('image_topic', 'camera/image_raw', 'Topic camera: pictures', read_only=True),
+    Parameter('significant_bits', 16, 'Topic camera: bits of 16-bit pictures that the driver '
+              'fills in, from the lowest', 'bit', choices=(10, 12, 14, 16), read_only=True),
+    Parameter('camera_id', '', 'GenICam camera: its id (as arv-tool-0.8 lists it) or IP address; '
+              'empty: the first one found', read_only=True),
+    Parameter('trigger_line', 'Line0', 'GenICam camera: input that the board triggers',
+              read_only=True),
+    Parameter('pixel_format', '', 'GenICam camera: pixel format (PFNC name, such as Mono12); '
+              'empty: as the camera is set', read_only=True),
 ]
-
-
-@dataclass
-class _Flat:
-    """A flat field: the lights it was taken with and one gain map for each."""
-
-    flat_id: str
-    lights: list[Light]
-    gain_maps: list[np.ndarray]
-
-    def for_lights(self, lights: list[Light], tolerance_counts: int,
-                   tolerance_tilt: float) -> list[np.ndarray]:
-        """Gain maps in the order of the lights, or an empty list if one light is not covered.
-
-        The stored maps are per unit intensity; what is returned is for the intensity of now.
-        """
-        maps = []
-        for light in lights:
-            found = [gain * np.float32(np.mean(light.intensity))
-                     for own, gain in zip(self.lights, self.gain_maps, strict=True)
-                     if (own.mode, own.panel) == (light.mode, light.panel)
-                     and abs(own.motor_counts - light.motor_counts) <= tolerance_counts
-                     and abs(own.tilt - light.tilt) <= tolerance_tilt]
-            if not found:
-                return []
-            maps.append(found[0])
-        return maps
-
-
-@dataclass
-class _Acquisition:
-    """Frames and lights of a finished recipe, matched."""
-
-    frames: list[Frame]
-    lights: list[Light]
-    ambient: Frame | None
-    duration: float      # first strobe to end of last exposure, s
 
 
 class CameraSequencer(Node):
     """See the README for topics, services, the action and parameters."""
-
-    # positions within this many counts count as the same illumination for a flat field
-    FLAT_TOLERANCE_COUNTS = 40
-    FLAT_TOLERANCE_TILT = 2e-3     # rad
 
     def __init__(self) -> None:
         super().__init__('camera_sequencer')
         self.parameters = ros_support.Parameters(
             self, PARAMETERS, ErrorCode.SEQUENCER_BAD_REQUEST)
         self.head = load_head(self.parameters['head_file'] or nominal_head_path())
-        self.recipes = sequence.load_recipes(self.parameters['recipe_file'] or _recipe_path())
+        self.recipes = load_recipes(self.parameters['recipe_file'] or _recipe_path())
         self.calibration: HeadCalibration | None = None
         self.session_id = ''
-        self.flat: _Flat | None = None
+        self.flat: FlatField | None = None
         self.captures = self.failures = 0
+        self.motion_px = math.nan
         self.last_error = ''
         self._busy = threading.Lock()
         self._running: ServerGoalHandle | None = None
@@ -150,13 +122,9 @@ class CameraSequencer(Node):
         self.create_subscription(
             ps.HeadCalibration, 'calibration', self._on_calibration, latched)
         self.create_subscription(String, 'session/active', self._on_session, latched)
-        # the replies must be able to arrive while a capture waits for them
-        clients = MutuallyExclusiveCallbackGroup()
-        self._illuminate = self.create_client(
-            SetIllumination, 'set_illumination', callback_group=clients)
-        self._run_program = self.create_client(
-            RunStrobeProgram, 'head_driver/run_strobe_program', callback_group=clients)
-        self._stop = self.create_client(Trigger, 'head_driver/stop', callback_group=clients)
+        self._head = HeadServices(self, lambda: (
+            self.parameters['move_timeout'], self.parameters['program_margin']))
+        self._acquirer = Acquirer(self.camera, self._head, self._settings, self._cancel.is_set)
         self.create_service(Capture, 'capture', self._on_capture, callback_group=parallel)
         self.create_service(CaptureFlat, 'capture_flat', self._on_flat, callback_group=parallel)
         self._action = ActionServer(
@@ -180,13 +148,16 @@ class CameraSequencer(Node):
         if self._running is not None and self._running.goal_id == goal.goal_id:
             self._cancel.set()
             self.camera.cancel()
-            self._stop_head()
+            self._head.stop()
         return CancelResponse.ACCEPT
 
-    def _stop_head(self) -> None:
-        """Panels off and motor stopped; does not wait for the answer."""
-        if self._stop.service_is_ready():
-            self._stop.call_async(Trigger.Request())
+    def _settings(self) -> Settings:
+        own = self.parameters
+        return Settings(
+            hardware=own['sequencing'] == 'hardware', exposure=own['default_exposure'],
+            **{name: own[name] for name in (
+                'gain', 'settle', 'frame_period', 'frame_timeout', 'time_tolerance',
+                'host_margin', 'max_motion', 'max_motor_motion')})
 
     # ------------------------------------------------------------------ requests
 
@@ -204,22 +175,14 @@ class CameraSequencer(Node):
             return 'no flat field'
         recipe = self.recipes.get(request.recipe)
         with self._exclusive():
-            rounds = [self._acquire(recipe, lambda *_: None)
-                      for _ in range(request.averages or 4)]
-        lights = rounds[0].lights
-        if not all(light.is_equation for light in lights):
-            raise PsError(ErrorCode.SEQUENCER_BAD_REQUEST,
-                          'a flat field needs a recipe of single panels')
-        gains = [sequence.gain_map(
-            [taken.frames[i].image for taken in rounds],
-            rounds[0].ambient.image if rounds[0].ambient else None,
-            self.parameters['flat_height']) for i in range(len(lights))]
-        for i, light in enumerate(lights):
-            gains[i] /= exposure(light) * float(np.mean(light.intensity))
-        peak = max(float(gain.max()) for gain in gains)
-        self.flat = _Flat(_new_id('flat'), lights, [gain / peak for gain in gains])
+            rounds = [self._acquire(recipe) for _ in range(request.averages or 4)]
+        first = rounds[0]
+        self.flat = make_flat_field(
+            _new_id('flat'), first.lights,
+            [[frame.image for frame in taken.frames] for taken in rounds],
+            first.ambient.image if first.ambient else None, self.parameters['flat_height'])
         response.flat_id = self.flat.flat_id
-        return f'flat field of {len(lights)} lights, {len(rounds)} pictures each'
+        return f'flat field of {len(first.lights)} lights, {len(rounds)} pictures each'
 
     def _on_acquire(self, goal: ServerGoalHandle) -> AcquireStack.Result:
         request, result = goal.request, AcquireStack.Result()
@@ -231,7 +194,7 @@ class CameraSequencer(Node):
             result.success, result.message = True, 'ok'
             result.stack_id = stack.stack_id
             result.exposure_times = [light.exposure_time for light in taken.lights]
-            result.duration = taken.duration
+            result.duration, result.motion_px = taken.duration, taken.motion_px
             goal.succeed()
         except Exception as error:
             known = ros_support.as_ps_error(self, error, ErrorCode.SEQUENCER_INTERNAL)
@@ -242,21 +205,22 @@ class CameraSequencer(Node):
                 goal.abort()
         return result
 
-    def _recipe_of(self, request: AcquireStack.Goal) -> sequence.Recipe:
-        if not request.steps:
-            recipe = self.recipes.get(request.recipe)
-            if not request.ambient_frame:
-                return recipe
+    def _recipe_of(self, request: AcquireStack.Goal) -> Recipe:
         try:
-            if not request.steps:
-                return sequence.Recipe.model_validate({**recipe.model_dump(), 'ambient': True})
-            modes, panels = ('BRIGHT_FIELD', 'DARK_FIELD', 'BOTH'), tuple(Panel.__members__)
-            steps = [{
-                'mode': modes[step.mode], 'panel': panels[step.panel],
-                'convergence_radius': step.convergence_radius, 'exposure': step.exposure_time,
-                'intensity': step.intensity or 1.0} for step in request.steps]
-            return sequence.Recipe.model_validate(
-                {'steps': steps, 'ambient': request.ambient_frame})
+            if request.steps:
+                modes, panels = ('BRIGHT_FIELD', 'DARK_FIELD', 'BOTH'), tuple(Panel.__members__)
+                content: dict[str, Any] = {'steps': [{
+                    'mode': modes[step.mode], 'panel': panels[step.panel],
+                    'convergence_radius': step.convergence_radius, 'gain': step.gain,
+                    'exposure': step.exposure_time, 'intensity': step.intensity or 1.0}
+                    for step in request.steps]}
+            else:
+                content = self.recipes.get(request.recipe).model_dump()
+            if request.ambient_frame:
+                content['ambient'] = True
+            if request.bracket:
+                content['bracket'] = list(request.bracket)
+            return Recipe.model_validate(content)
         except (IndexError, ValueError) as error:
             reason = ' '.join(str(error).split())
             raise PsError(ErrorCode.SEQUENCER_BAD_REQUEST, f'steps: {reason}') from error
@@ -284,14 +248,14 @@ class CameraSequencer(Node):
     # ------------------------------------------------------------------ capture
 
     def _capture(
-        self, recipe: sequence.Recipe, part_id: str, pose: Pose = Pose(),  # noqa: B008
-        progress: Callable[[int, int, bool], None] = lambda *_: None,
-    ) -> tuple[Stack, _Acquisition]:
+        self, recipe: Recipe, part_id: str, pose: Pose = Pose(),  # noqa: B008
+        progress: Progress = lambda *_: None,
+    ) -> tuple[Stack, Acquisition]:
         """Take one stack and publish it; acquisition_done goes out as soon as the light is off."""
         stack_id = _new_id('stack')
         done_sent = False
 
-        def on_progress(state: int, frames: int, safe_to_move: bool) -> None:
+        def on_progress(state: Stage, frames: int, safe_to_move: bool) -> None:
             nonlocal done_sent
             if safe_to_move and not done_sent:
                 self._publish_done(stack_id, True, ErrorCode.NONE, 'ok')
@@ -311,96 +275,28 @@ class CameraSequencer(Node):
         self._stack.publish(stack_to_message(stack))
         self.captures += 1
         self.last_error = ''
-        progress(AcquireStack.Feedback.PUBLISHED, len(stack.images), True)
+        progress(Stage.PUBLISHED, len(stack.images), True)
         return stack, taken
 
-    def _acquire(
-        self, recipe: sequence.Recipe, progress: Callable[[int, int, bool], None],
-    ) -> _Acquisition:
-        """Run the programs of a recipe and collect its frames."""
-        state = AcquireStack.Feedback
+    def _acquire(self, recipe: Recipe, progress: Progress = lambda *_: None) -> Acquisition:
         self._open_camera()
-        frames: list[Frame] = []
-        lights: list[Light] = []
-        duration = 0.0
-        segments = sequence.plan(recipe, self.parameters['default_exposure'])
-        for segment in segments:
-            last = segment is segments[-1]
-            if segment.convergence_radius > 0:
-                progress(state.MOVING, len(frames), False)
-                self._ask_head(self._illuminate, SetIllumination.Request(
-                    by=SetIllumination.Request.BY_CONVERGENCE_RADIUS,
-                    convergence_radius=segment.convergence_radius),
-                    self.parameters['move_timeout'])
-            self._check_cancelled()
-            progress(state.ARMING, len(frames), False)
-            shots = segment.shots
-            self.camera.arm([shot.exposure for shot in shots],
-                            panels=[(shot.mode, shot.panel) for shot in shots],
-                            gain=self.parameters['gain'])
-            try:
-                self._check_cancelled()
-                progress(state.EXPOSING, len(frames), False)
-                steps = [self._strobe_step(shot) for shot in shots]
-                duration_s = sum(s.settle + s.strobe_duration + s.period for s in steps)
-                answer = self._ask_head(self._run_program, RunStrobeProgram.Request(steps=steps),
-                                        duration_s + self.parameters['program_margin'])
-                own = [
-                    replace(message_to_light(light), exposure_time=shot.exposure,
-                            gain=self.parameters['gain'])
-                    for light, shot in zip(answer.lights, shots, strict=True)]
-                progress(state.COLLECTING, len(frames), last)
-                arrived = self.camera.collect(len(shots), self.parameters['frame_timeout'])
-                self._check_cancelled()
-                matched = sequence.match(arrived, own, self.parameters['time_tolerance'])
-            finally:
-                self.camera.disarm()
-            frames += matched
-            lights += [replace(light, frame_counter=frame.frame_counter)
-                       for light, frame in zip(own, matched, strict=True)]
-            duration += ((own[-1].device_time_ns - own[0].device_time_ns) * 1e-9
-                         + shots[-1].exposure)
-        sequence.check_images(frames)
-        ambient = None
-        if recipe.ambient:
-            ambient, frames, lights = frames[-1], frames[:-1], lights[:-1]
-        return _Acquisition(frames, lights, ambient, duration)
+        taken = self._acquirer.acquire(recipe, progress)
+        self.motion_px = taken.motion_px
+        return taken
 
     def _open_camera(self) -> None:
         if not self._camera_open:
             self.camera.open()
             self._camera_open = True
 
-    def _strobe_step(self, shot: sequence.Shot) -> ps.StrobeStep:
-        return ps.StrobeStep(
-            mode=int(shot.mode), panel=int(shot.panel), intensity=shot.intensity,
-            settle=self.parameters['settle'], strobe_duration=shot.exposure,
-            period=max(self.parameters['frame_period'], shot.exposure))
-
-    def _ask_head(self, client: Any, request: Any, timeout: float) -> Any:
-        try:
-            answer = call(client, request, timeout, ErrorCode.SEQUENCER_HEAD_UNAVAILABLE)
-        except PsError:
-            self._stop_head()      # it may still be moving or flashing
-            raise
-        if not answer.success:
-            name = _code_name(answer.error_code)
-            self._check_cancelled()
-            raise PsError(ErrorCode.SEQUENCER_HEAD_FAILED, f'head: {name}: {answer.message}')
-        return answer
-
-    def _check_cancelled(self) -> None:
-        if self._cancel.is_set():
-            raise PsError(ErrorCode.SEQUENCER_CANCELLED, 'cancelled; no stack was published')
-
     # ------------------------------------------------------------------ the stack
 
-    def _assemble(self, taken: _Acquisition, stack_id: str, part_id: str, pose: Pose) -> Stack:
+    def _assemble(self, taken: Acquisition, stack_id: str, part_id: str, pose: Pose) -> Stack:
         stack = Stack(
             images=[frame.image for frame in taken.frames],
             lights=with_exposure_scale(taken.lights),
             ambient=taken.ambient.image if taken.ambient else None, stack_id=stack_id,
-            part_id=part_id, session_id=self.session_id, stamp_ns=_mid_exposure(taken),
+            part_id=part_id, session_id=self.session_id, stamp_ns=taken.stamp_ns,
             head_pose=pose)
         source = self.camera.source_stack
         if source is not None:
@@ -421,8 +317,7 @@ class CameraSequencer(Node):
         except PsError:
             pass     # the axes do not meet the plane: CR stays NaN, the stack is good all the same
         if self.flat is not None:
-            gains = self.flat.for_lights(
-                taken.lights, self.FLAT_TOLERANCE_COUNTS, self.FLAT_TOLERANCE_TILT)
+            gains = self.flat.for_lights(taken.lights)
             if gains:
                 stack = replace(stack, gain_maps=gains, flat_id=self.flat.flat_id)
             else:
@@ -457,8 +352,11 @@ class CameraSequencer(Node):
         self._done.publish(done)
 
     def _diagnose(self) -> ros_support.Report:
-        values = {'back end': self.parameters['camera'], 'captures': self.captures,
+        values = {'back end': self.parameters['camera'],
+                  'sequencing': self.parameters['sequencing'], 'captures': self.captures,
                   'failures': self.failures, 'busy': self._busy.locked(),
+                  'motion in the last stack [px]': 'not measurable'
+                  if math.isnan(self.motion_px) else f'{self.motion_px:.2f}',
                   'flat field': self.flat.flat_id if self.flat else 'none',
                   'calibration': self.calibration.calibration_id if self.calibration else 'none'}
         if self.last_error:
@@ -478,16 +376,6 @@ def _recipe_path() -> Path:
 
 def _new_id(kind: str) -> str:
     return f'{kind}-{time.strftime("%Y%m%dT%H%M%S", time.gmtime())}-{uuid.uuid4().hex[:8]}'
-
-
-def _code_name(code: int) -> str:
-    return ErrorCode(code).name if code in ErrorCode._value2member_map_ else str(code)
-
-
-def _mid_exposure(taken: _Acquisition) -> int:
-    first, last = taken.frames[0], taken.frames[-1]
-    end = last.host_time_ns + int(last.exposure_time * 1e9)
-    return (first.host_time_ns + end) // 2
 
 
 def _fit(camera: CameraGeometry, shape: tuple[int, int]) -> CameraGeometry:

@@ -1,6 +1,11 @@
-"""The camera back ends folder and topic in a real graph."""
+"""The camera back ends folder, topic and GenICam in a real graph."""
 from collections.abc import Iterator
+from contextlib import contextmanager
+import fcntl
 from pathlib import Path
+import shutil
+import subprocess
+import tempfile
 import threading
 
 import cv2
@@ -11,6 +16,7 @@ pytest.importorskip('ps_interfaces.msg', reason='needs the built workspace (make
 
 from sensor_msgs.msg import Image
 
+from ps_head_driver.cameras import aravis
 from ps_head_driver.conversions import image_to_message, message_to_image, time_to_message
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.fake.trigger_socket import TriggerListener, default_path
@@ -20,6 +26,7 @@ from ps_inspection.graph import NODES
 from ps_inspection.runner import Cell
 
 pytestmark = [pytest.mark.graph, pytest.mark.usefixtures('ros_domain')]
+FAKE_GIGE = 'arv-fake-gv-camera-0.8'
 NEEDED = [node for node in NODES if node.executable in (
     'head_driver', 'camera_sequencer', 'reconstruction')]
 
@@ -124,6 +131,54 @@ def test_topic_camera_matches_frames_by_their_stamps(topic_cell: CellClient):
         assert topic_cell.capture() in topic_cell.done
     finally:
         driver.close()
+
+
+@pytest.mark.skipif(
+    not (aravis.is_installed() and shutil.which(FAKE_GIGE)),
+    reason=f'needs Aravis and its {FAKE_GIGE}: sudo apt install libaravis-0.8-0 aravis-tools')
+def test_genicam_camera_stepped_by_the_host_lost_and_found(tmp_path: Path):
+    settings = tmp_path / 'settings.yaml'
+    settings.write_text('/**:\n  ros__parameters:\n    sequencing: host\n'
+                        '    camera_id: 127.0.0.1\n    max_motion: 0.0\n')
+    arguments = {'fake_hardware': 'true', 'camera': 'genicam', 'params_file': str(settings)}
+    with open(Path(tempfile.gettempdir()) / 'ps_test_gige.lock', 'w') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)      # the fake camera's port is fixed
+        with Cell(arguments, nodes=NEEDED, log_folder=tmp_path), CellClient() as client:
+            client.home()
+            with pytest.raises(PsError) as error:
+                client.capture()
+            assert error.value.code == ErrorCode.SEQUENCER_CAMERA_LOST
+            with fake_gige():
+                check_host_stepped(client)
+            with pytest.raises(PsError) as error:
+                client.capture()
+            assert error.value.code == ErrorCode.SEQUENCER_CAMERA_LOST
+            with fake_gige():
+                check_host_stepped(client)
+
+
+def check_host_stepped(client: CellClient) -> None:
+    """One capture, with the exposures inside the lights."""
+    message = client.stack(client.capture())
+    assert [image.encoding for image in message.images] == ['mono8'] * 4
+    assert [light.panel for light in message.lights] == [Panel.E, Panel.N, Panel.W, Panel.S]
+    first = message.lights[0].frame_counter
+    for i, light in enumerate(message.lights):
+        assert light.exposure_time == pytest.approx(0.004)
+        assert light.strobe_duration > light.exposure_time
+        assert light.frame_counter == first + i
+
+
+@contextmanager
+def fake_gige() -> Iterator[subprocess.Popen]:
+    """Aravis' own GigE Vision camera on the loopback interface."""
+    process = subprocess.Popen([FAKE_GIGE, '-i', '127.0.0.1', '-s', 'GRAPH'],
+                               stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
 
 
 def capture_when_found(client: CellClient) -> str:

@@ -166,7 +166,8 @@ class CameraSequencer(Node):
         with self._exclusive():
             stack, taken = self._capture(self.recipes.get(request.recipe), request.part_id)
         response.stack_id = stack.stack_id
-        return f'{len(stack.images)} frames in {taken.duration * 1e3:.0f} ms'
+        return (f'{len(stack.images)} frames in {taken.duration * 1e3:.0f} ms, motion '
+                + _motion_text(taken.motion_px))
 
     @answers(ErrorCode.SEQUENCER_INTERNAL)
     def _on_flat(self, request: CaptureFlat.Request, response: CaptureFlat.Response) -> str:
@@ -355,8 +356,7 @@ class CameraSequencer(Node):
         values = {'back end': self.parameters['camera'],
                   'sequencing': self.parameters['sequencing'], 'captures': self.captures,
                   'failures': self.failures, 'busy': self._busy.locked(),
-                  'motion in the last stack [px]': 'not measurable'
-                  if math.isnan(self.motion_px) else f'{self.motion_px:.2f}',
+                  'motion in the last stack': _motion_text(self.motion_px),
                   'flat field': self.flat.flat_id if self.flat else 'none',
                   'calibration': self.calibration.calibration_id if self.calibration else 'none'}
         if self.last_error:
@@ -376,6 +376,10 @@ def _recipe_path() -> Path:
 
 def _new_id(kind: str) -> str:
     return f'{kind}-{time.strftime("%Y%m%dT%H%M%S", time.gmtime())}-{uuid.uuid4().hex[:8]}'
+
+
+def _motion_text(motion_px: float) -> str:
+    return 'not measurable' if math.isnan(motion_px) else f'{motion_px:.1f} px'
 
 
 def _fit(camera: CameraGeometry, shape: tuple[int, int]) -> CameraGeometry:

@@ -241,9 +241,13 @@ def test_session_is_played_into_the_graph(peer: Peer) -> None:
         HeadCalibration, '/other/calibration', lambda m: calibrations.append(m.calibration_id),
         LATCHED)
     # from the second stack on; the calibration before it comes all the same
+    times = [message.log_time for message in Session(folder).messages()
+             if message.topic.name != '/diagnostics']
+    second = [message.log_time for message in Session(folder).stack_messages()][1]
+    start = (second - times[0]) * 1e-9 - 0.05
     command = subprocess.Popen(
         [sys.executable, '-m', 'ps_inspection.cli.ps_session', 'play', str(folder),
-         '--namespace', 'other', '--start', '0.15', '--rate', '2'], stdout=subprocess.PIPE)
+         '--namespace', 'other', '--start', str(start), '--rate', '2'], stdout=subprocess.PIPE)
     try:
         peer.until(lambda: command.poll() is not None, 30)
     finally:

@@ -200,7 +200,11 @@ def _pitch(stack: Stack, options: Options) -> float:
     if stack.camera is None:
         return options.pixel_pitch or 1.0
     depth = stack.camera.camera_standoff - stack.plane.offset / stack.plane.normal[2]
-    return depth / stack.camera.fx
+    pitch = depth / stack.camera.fx
+    if not 1e-12 < pitch < 1e3:
+        raise PsError(ErrorCode.RECONSTRUCTION_BAD_STACK,
+                      f'camera_info, plane: a pixel would be {pitch:g} m wide')
+    return pitch
 
 
 def _integrate(result: Reconstruction, stack: Stack, rays: integration.Rays, options: Options,

@@ -6,6 +6,7 @@ is bag_file.py (writing) and session_reader.py (reading).
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import errno
+from functools import cache
 import json
 import os
 from pathlib import Path
@@ -98,6 +99,7 @@ def stack_id_of(data: bytes) -> str:
     return text.rstrip(b'\0').decode('utf-8', 'replace')
 
 
+@cache
 def message_definition(message_type: str) -> tuple[str, str]:
     """Definition with comments, and hash, of an installed message type.
 
@@ -174,7 +176,7 @@ def write_atomically(path: Path, content: Mapping[str, Any]) -> None:
     temporary.replace(path)
 
 
-class _PlainDumper(yaml.SafeDumper):
+class _PlainDumper(getattr(yaml, 'CSafeDumper', yaml.SafeDumper)):    # type: ignore[misc]
     """Without anchors and aliases, which rosbag2's reader need not know."""
 
     def ignore_aliases(self, data: Any) -> bool:

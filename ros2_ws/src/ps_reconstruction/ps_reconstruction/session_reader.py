@@ -10,6 +10,7 @@ from importlib import import_module
 from io import BytesIO
 from itertools import islice
 from pathlib import Path
+import re
 import struct
 from typing import Any, BinaryIO
 import zlib
@@ -18,7 +19,6 @@ import lz4.frame
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-import yaml
 import zstandard
 
 from ps_head_driver.errors import ErrorCode, PsError
@@ -32,7 +32,6 @@ from ps_reconstruction.session_format import (
 
 MAGIC = b'\x89MCAP0\r\n'
 MAX_CHUNK_BYTES = 1 << 30       # the largest stack that is read
-MAX_QOS_CHARACTERS = 10_000
 
 
 @dataclass(frozen=True)
@@ -251,8 +250,8 @@ class Session:
             yield _READERS[opcode](ReadDataStream(content), length)
             return
         chunk = records.Chunk.read(ReadDataStream(content))
-        scan.compression = chunk.compression or 'none'
         content = BytesIO(self._decompressed(chunk))
+        scan.compression = chunk.compression or 'none'
         while True:
             opcode, length = _record_head(content)
             if not opcode:
@@ -306,13 +305,11 @@ def _topic(channel: records.Channel, schema: records.Schema) -> Topic:
 
 
 def _is_latched(channel: records.Channel) -> bool:
-    text = channel.metadata.get('offered_qos_profiles', '')
-    try:
-        profiles = yaml.safe_load(text if len(text) < MAX_QOS_CHARACTERS else '') or []
-        # rosbag2 wrote numbers before version 9
-        return bool(profiles[0].get('durability') in ('transient_local', 1))
-    except Exception:       # a foreign text can fail in any way, deep nesting with RecursionError
-        return False
+    # not parsed as YAML: a text of brackets would take its parser seconds
+    durability = re.search(r'durability:\s*(\w+)',
+                           channel.metadata.get('offered_qos_profiles', ''))
+    # rosbag2 wrote numbers before version 9
+    return durability is not None and durability[1] in ('transient_local', '1')
 
 
 def decode(data: bytes, message_type: str) -> Any:

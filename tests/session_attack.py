@@ -40,14 +40,14 @@ def use(folder: Path, out: Path, seed: int) -> None:
         for message in session.stacks():
             with suppress(PsError):
                 stack = message_to_stack(message)
-                if seed % 7 == 0:
+                if seed % 14 == 0:
                     reconstruct(stack)
-        if seed % 5 == 0:
+        if seed % 10 == 0:
             export_session(session, out / 'export')
         if seed % 100 == 0:
             reconstruct_session(session, out / 'again')
             write_report(session, out / 'report.html')
-        if seed % 2:
+        if seed % 4 == 1:
             recover(session)
             assert Session(folder).info().complete
             assert not recover(Session(folder)).changed

@@ -2,7 +2,7 @@
 
 Every input is a real session changed by one of a dozen mutations (tests/session_mutator.py). It is
 read and decoded, and by turns reconstructed, exported, reported and recovered. The number of
-inputs is 3000, or the environment variable PS_BENCH_INPUTS.
+inputs is 3000, or the environment variable PS_BENCH_INPUTS; PS_BENCH_PROCESSES sets how many work.
 """
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -20,7 +20,7 @@ from rich.table import Table
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 BATCH = 500
-PROCESSES = min(2, len(os.sched_getaffinity(0)))
+PROCESSES = int(os.environ.get('PS_BENCH_PROCESSES', len(os.sched_getaffinity(0))))
 
 
 def main() -> None:

@@ -249,8 +249,11 @@ def message_to_stack(message: ps.PhotometricStack) -> Stack:
     except ValueError as error:
         raise PsError(bad, f'geometry: {error}') from error
     pose = message.head_pose
+    lights = [message_to_light(m) for m in message.lights]
+    # a gain of thousands of dB
+    lights = _checked(bad, 'lights', lambda: with_exposure_scale(lights))
     return Stack(
-        images=images, lights=with_exposure_scale([message_to_light(m) for m in message.lights]),
+        images=images, lights=lights,
         camera=message_to_camera(message.camera_info, message.camera_standoff),
         ambient=ambient, mask=mask, gain_maps=[message_to_image(m) for m in message.gain_maps],
         plane=Plane(_tuple(message.plane_normal), message.plane_offset), geometry=geometry,

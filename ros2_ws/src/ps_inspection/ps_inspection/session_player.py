@@ -10,6 +10,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from ps_head_driver.errors import ErrorCode, PsError
+from ps_reconstruction import cdr
 from ps_reconstruction.session_format import TOPICS, Topic
 from ps_reconstruction.session_reader import Message, Scan, Session
 
@@ -43,6 +44,8 @@ class Player:
 
     :param paused: asked often; playing stands still while it is true.
     :param on_message: called for every message sent.
+
+    ``problems`` has the damage found in the last round.
     """
 
     def __init__(self, node: Node, session: Session, options: PlayOptions,
@@ -50,6 +53,7 @@ class Player:
                  on_message: Callable[[Message], None] = lambda _: None) -> None:
         self._node, self._session, self._options = node, session, options
         self._paused, self._on_message = paused, on_message
+        self.problems: list[str] = []
         self._publishers: dict[str, Publisher] = {}
         self._known = {topic.type for topic in TOPICS} - (
             set() if options.everything else set(DERIVED))
@@ -66,12 +70,18 @@ class Player:
             clock: _Clock | None = None
             before = sent
             for message in self._due(scan):
+                try:
+                    cdr.check(message.data, message.topic.type)
+                except ValueError as error:     # would cost every reader its memory
+                    scan.note(f'{message.topic.name}: a message is left out: {error}')
+                    continue
                 self._advertise([message.topic, *scan.topics], scan)
                 clock = clock or _Clock(message.log_time, self._options.rate)
                 self._sleep_until(clock, message.log_time)
                 self._publishers[message.topic.name].publish(message.data)
                 self._on_message(message)
                 sent += 1
+            self.problems = scan.problems
             if sent == before:
                 raise PsError(ErrorCode.SESSION_NOT_A_SESSION,
                               f'{self._session.file} has nothing to play')
@@ -105,6 +115,7 @@ class Player:
         missing = {topic.name: topic for topic in topics
                    if topic.type in self._known and topic.name not in self._publishers}
         for topic in missing.values():
+            self._session.check_definition(topic)
             package, _, name = topic.type.split('/')
             try:
                 self._publishers[topic.name] = self._node.create_publisher(

@@ -110,8 +110,8 @@ def recorded_options(scan: Scan) -> Options:
             value: Any = {'True': True, 'False': False}[text] if kind is bool else kind(text)
             options = replace(options, **{option.name: value})
         except (ValueError, KeyError, PsError):
-            scan.problems.append(f'recorded parameter {option.name} is not usable; '
-                                 f'{option.default!r} is used')
+            scan.note(f'recorded parameter {option.name} is not usable; '
+                      f'{option.default!r} is used')
     return options
 
 

@@ -91,8 +91,8 @@ class _Summarizer:
             'diagnostic_msgs/msg/DiagnosticArray': self._on_diagnostics}
 
     def run(self) -> Summary:
-        summary, problems = self._summary, self._summary.scan.problems
-        for message in self._session.messages(summary.scan):
+        summary, scan = self._summary, self._summary.scan
+        for message in self._session.messages(scan):
             if not summary.messages:
                 summary.start_ns = message.log_time
             summary.messages += 1
@@ -105,12 +105,12 @@ class _Summarizer:
                 self._session.check_definition(message.topic)
             except PsError as error:
                 self._foreign.add(message.topic.type)
-                problems.append(error.message)
+                scan.note(error.message)
                 continue
             try:
                 handler(message, decode(message.data, message.topic.type), time)
             except (ValueError, PsError) as error:
-                problems.append(f'{message.topic.name} after {time:.3f} s: {reason(error)}')
+                scan.note(f'{message.topic.name} after {time:.3f} s: {reason(error)}')
         return summary
 
     def _event(self, time: float, kind: str, source: str, text: str) -> None:

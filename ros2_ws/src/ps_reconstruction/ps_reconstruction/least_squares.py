@@ -161,6 +161,8 @@ def check_lights(lights: NDArray) -> None:
     square = np.linalg.eigvalsh(np.swapaxes(lights, -1, -2) @ lights)
     condition = float(np.sqrt(np.max(
         square[..., 2] / np.maximum(square[..., 0], 1e-14 * square[..., 2] + 1e-300))))
+    if not np.all(square[..., 2] > 1e-100):     # as of a light that is infinitely far away
+        condition = float('inf')
     if condition > MAX_CONDITION:
         raise PsError(ErrorCode.RECONSTRUCTION_DEGENERATE_LIGHTS,
                       'the light directions lie (nearly) in one plane: condition number '

@@ -31,7 +31,9 @@ from ps_reconstruction.session_format import (
 )
 
 MAGIC = b'\x89MCAP0\r\n'
-MAX_CHUNK_BYTES = 1 << 30       # the largest stack that is read
+MAX_CHUNK_BYTES = 1 << 30           # the largest stack that is read
+MAX_DESCRIPTION_BYTES = 64 << 20    # of topics, types and provenance together
+MAX_PROBLEMS = 200
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,13 @@ class Scan:
     compression: str = 'none'
     topics: list[Topic] = field(default_factory=list)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+
+    def note(self, problem: str) -> None:
+        """Add to ``problems``, of which a hostile file may have as many as it has bytes."""
+        if len(self.problems) < MAX_PROBLEMS:
+            self.problems.append(problem)
+        elif len(self.problems) == MAX_PROBLEMS:
+            self.problems.append('there are more problems than are listed')
 
 
 @dataclass(frozen=True)
@@ -124,26 +133,34 @@ class Session:
         :param scan: filled on the way.
         """
         scan = Scan() if scan is None else scan
-        schemas: dict[int, records.Schema] = {}
+        definitions: dict[int, tuple[str, str]] = {}        # schema id: type and its text
         topics: dict[int, Topic] = {}
+        named: dict[str, Topic] = {}
+        described = 0
         for record, place in self._records(scan):
-            if isinstance(record, records.Schema):
-                schemas[record.id] = record
-            elif isinstance(record, records.Channel):
-                if record.id not in topics and record.schema_id in schemas:
-                    topic = _topic(record, schemas[record.schema_id])
-                    known = {other.name: other for other in scan.topics}.get(topic.name)
-                    if known is None:
-                        scan.topics.append(topic)
-                    elif known.type != topic.type:
-                        scan.problems.append(f'topic {topic.name} has two types')
-                        continue
-                    topics[record.id] = known or topic
+            if isinstance(record, records.Message):
+                if record.channel_id in topics:
+                    yield Message(topics[record.channel_id], record.data, record.log_time,
+                                  record.publish_time, place)
+                continue
+            described += _size(record)
+            if described > MAX_DESCRIPTION_BYTES:
+                scan.note(f'topics and metadata after byte {place.offset} are left out: together '
+                          f'they are larger than {MAX_DESCRIPTION_BYTES} bytes')
+            elif isinstance(record, records.Schema):
+                definitions[record.id] = record.name, record.data.decode('utf-8', 'replace')
             elif isinstance(record, records.Metadata):
                 scan.metadata[record.name] = dict(record.metadata)
-            elif isinstance(record, records.Message) and record.channel_id in topics:
-                yield Message(topics[record.channel_id], record.data, record.log_time,
-                              record.publish_time, place)
+            elif (isinstance(record, records.Channel) and record.id not in topics
+                    and record.schema_id in definitions):
+                topic = _topic(record, *definitions[record.schema_id])
+                known = named.setdefault(topic.name, topic)
+                if known is topic:
+                    scan.topics.append(topic)
+                elif known.type != topic.type:
+                    scan.note(f'topic {topic.name} has two types')
+                    continue
+                topics[record.id] = known
 
     def read(self, place: Place) -> bytes:
         """Serialized message at a place that ``messages`` told, without reading what is before.
@@ -175,7 +192,7 @@ class Session:
             try:
                 yield decode(message.data, STACK_TYPE)
             except ValueError as error:
-                scan.problems.append(f'stack {number} cannot be decoded: {error}')
+                scan.note(f'stack {number} cannot be decoded: {error}')
 
     def stack_messages(self, scan: Scan | None = None) -> Iterator[Message]:
         """All photometric stacks, serialized.
@@ -225,7 +242,7 @@ class Session:
                 opcode, length = _record_head(stream)
                 if not opcode or length > size - stream.tell():
                     scan.lost_bytes += size - start
-                    scan.problems.append(f'the file ends inside a record, at byte {start}')
+                    scan.note(f'the file ends inside a record, at byte {start}')
                     return
                 if opcode == Opcode.FOOTER:
                     scan.complete = True
@@ -234,7 +251,7 @@ class Session:
                         yield record, Place(start, number)
                 except Exception as error:      # a damaged record can fail in any way
                     scan.lost_bytes += length + 9
-                    scan.problems.append(
+                    scan.note(
                         f'record at byte {start} is damaged: {type(error).__name__}: {error}')
                 stream.seek(start + 9 + length)
 
@@ -298,9 +315,17 @@ _READERS: dict[int, Callable[[ReadDataStream, int], records.McapRecord]] = {
 }
 
 
-def _topic(channel: records.Channel, schema: records.Schema) -> Topic:
-    return Topic(channel.topic, schema.name, _is_latched(channel),
-                 schema.data.decode('utf-8', 'replace'),
+def _size(record: records.McapRecord) -> int:
+    """Bytes, about, that keeping a schema, channel or metadata record takes."""
+    texts = [value for value in vars(record).values() if isinstance(value, str | bytes)]
+    for pairs in vars(record).values():
+        if isinstance(pairs, dict):
+            texts += [*pairs.keys(), *pairs.values()]
+    return 1000 + sum(map(len, texts))
+
+
+def _topic(channel: records.Channel, message_type: str, definition: str) -> Topic:
+    return Topic(channel.topic, message_type, _is_latched(channel), definition,
                  channel.metadata.get('topic_type_hash', ''))
 
 

@@ -3,7 +3,6 @@ import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from datetime import datetime
-from functools import partial
 import json
 import os
 from pathlib import Path
@@ -19,6 +18,17 @@ from ps_inspection.session_recovery import recover
 from ps_reconstruction.session_reader import Session
 
 Report = dict[str, Any]
+
+
+class _PlainConsole(Console):
+    """Shows texts of files as they are: no markup, and nothing that a terminal would obey."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        super().print(*(_plain(o) if isinstance(o, str) else o for o in objects), **options)
+
+
+def _plain(text: str) -> str:
+    return ''.join(c if c.isprintable() or c == '\n' else '?' for c in text)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -72,19 +82,24 @@ def _parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line."""
     options = _parser().parse_args(argv)
-    console = Console(highlight=False)
+    console = _PlainConsole(highlight=False, markup=False)
     try:
         report = options.run(options, console)
         if options.json:
             options.json.write_text(json.dumps(report, indent=2) + '\n')
     except PsError as error:
-        sys.exit(f'ps_session: {error.message}')
+        sys.exit(f'ps_session: {_plain(error.message)}')
     except OSError as error:
         sys.exit(f'ps_session: {error.filename}: {error.strerror}')
     except KeyboardInterrupt:
         sys.exit(130)
     if report.get('failed'):
         sys.exit(f'ps_session: {len(report["failed"])} stacks failed')
+
+
+def _damage(problems: Sequence[str], console: Console) -> None:
+    for problem in problems:
+        console.print(f'damage: {problem}', style='yellow')
 
 
 def _positive(text: str) -> float:
@@ -105,17 +120,16 @@ def _info(options: argparse.Namespace, console: Console) -> Report:
     info = Session(options.session).info()
     table = Table('topic', 'type', 'messages', box=None, pad_edge=False)
     for name, count in info.counts.items():
-        table.add_row(name, info.types[name], str(count))
+        table.add_row(_plain(name), _plain(info.types[name]), str(count))
     about = info.scan.metadata.get('session', {})
     for name, value in about.items():
-        console.print(f'{name:12} {value}', markup=False)
+        console.print(f'{name:12} {value}')
     start = datetime.fromtimestamp(info.start * 1e-9).astimezone()
     console.print(f'start        {start.isoformat(timespec="milliseconds")}')
     console.print(f'duration     {(info.end - info.start) * 1e-9:.3f} s')
     console.print(f'size         {info.size_bytes / 1e6:.1f} MB, {info.scan.compression}')
     console.print(table)
-    for problem in info.scan.problems:
-        console.print(f'damage: {problem}', style='yellow', markup=False)
+    _damage(info.scan.problems, console)
     if not info.complete:
         console.print('unfinished: "ps_session recover" makes it complete', style='yellow')
     return {
@@ -127,8 +141,7 @@ def _info(options: argparse.Namespace, console: Console) -> Report:
 
 def _recover(options: argparse.Namespace, console: Console) -> Report:
     result = recover(Session(options.session))
-    for problem in result.problems:
-        console.print(f'damage: {problem}', style='yellow', markup=False)
+    _damage(result.problems, console)
     console.print(f'{"recovered" if result.changed else "nothing to do"}: {result.messages} '
                   f'messages, {result.stacks} stacks, {result.lost_bytes} bytes given up')
     return asdict(result)
@@ -156,16 +169,18 @@ def _play(options: argparse.Namespace, console: Console) -> Report:
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
         node = rclpy.create_node('ps_session_player')
-        sent = Player(
+        player = Player(
             node, session,
             PlayOptions(options.rate, options.start, options.loop, options.all,
                         options.namespace),
             is_paused,
             lambda message: console.print(f'{message.log_time * 1e-9:.3f} {message.topic.name}'),
-        ).play()
+        )
+        sent = player.play()
         node.destroy_node()
     finally:
         rclpy.try_shutdown()
+    _damage(player.problems, console)
     console.print(f'{sent} messages played')
     return {'messages': sent}
 
@@ -173,7 +188,7 @@ def _play(options: argparse.Namespace, console: Console) -> Report:
 def _export(options: argparse.Namespace, console: Console) -> Report:
     from ps_inspection.session_export import export_session
     return _said(asdict(export_session(Session(options.session), options.out,
-                                 partial(console.print, markup=False))),
+                                 console.print)),
                  options.out, console)
 
 
@@ -181,24 +196,22 @@ def _reconstruct(options: argparse.Namespace, console: Console) -> Report:
     from ps_inspection.session_reconstruct import Workers, reconstruct_session
     outcome = reconstruct_session(
         Session(options.session), options.out, options.method,
-        Workers(options.workers, options.scheduler), partial(console.print, markup=False))
+        Workers(options.workers, options.scheduler), console.print)
     return _said(asdict(outcome), options.out, console)
 
 
 def _report(options: argparse.Namespace, console: Console) -> Report:
     from ps_inspection.session_report import write_report
     outcome = write_report(Session(options.session), options.out, options.pictures,
-                           partial(console.print, markup=False))
-    for problem in outcome.problems:
-        console.print(f'damage: {problem}', style='yellow', markup=False)
+                           console.print)
+    _damage(outcome.problems, console)
     console.print(f'{options.out}: {outcome.stacks} stacks, {outcome.pictures} with pictures, '
                   f'{outcome.faults} faults')
     return asdict(outcome)
 
 
 def _said(report: Report, out: Path, console: Console) -> Report:
-    for problem in report['problems']:
-        console.print(f'damage: {problem}', style='yellow', markup=False)
+    _damage(report['problems'], console)
     console.print(f'{out}: {report["done"]} stacks written, {report["skipped"]} were there, '
                   f'{len(report["failed"])} failed')
     return report

@@ -1,5 +1,6 @@
 """The calibrate_ring action over DDS, with a fake head that is not what its file says."""
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 import threading
 import time
@@ -18,7 +19,8 @@ from ps_calibration.graph import NODES as CALIBRATION_NODES
 from ps_calibration.ring_fit import corrected
 from ps_calibration.ring_target import default_target_path, load_target
 from ps_calibration.synthetic import Bench, errors_of, solid_of
-from ps_head_driver.calibration_file import apply, read_calibration
+from ps_head_driver.calibration_file import HeadCalibration as HeadCalibrationFile
+from ps_head_driver.calibration_file import apply, read_calibration, write_calibration
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.fake.ring_renderer import RingSolid, placement
 from ps_head_driver.graph import NODES as HEAD_NODES
@@ -159,6 +161,41 @@ def test_calibration_brings_the_lights_closer_to_the_truth(
     listed = client.call(Trigger, 'ring_calibration/list').message
     assert f'{identifier}.yaml  OK' in listed
     assert listed.endswith('(active)')
+
+
+def test_files_are_loaded_saved_and_refused(client: CellClient, folder: Path) -> None:
+    ours = client.status.serial_number
+    files = folder / 'files'
+
+    def write(name: str, serial: str, verdict: str = 'OK') -> None:
+        write_calibration(HeadCalibrationFile(
+            calibration_id=name, created=datetime.now(UTC), head_serial=serial,
+            camera=NOMINAL.camera, verdict=verdict), files / f'{name}.yaml')
+
+    def request(service: str, file: str) -> str:
+        return client.call(srv.CalibrationFile, f'ring_calibration/{service}',
+                           srv.CalibrationFile.Request(file=file)).calibration_id
+
+    write('good', ours)
+    write('failed', ours, 'FAILED')
+    write('foreign', 'another head')
+    (files / 'edited.yaml').write_text(
+        (files / 'good.yaml').read_text().replace('z_scale: 1.0', 'z_scale: 1.1'))
+    assert request('load', 'good.yaml') == 'good'
+    for name, code, reason in (
+            ('foreign', ErrorCode.CALIBRATION_WRONG_HEAD, 'another head'),
+            ('edited', ErrorCode.CALIBRATION_FILE_INVALID, 'hash'),
+            ('failed', ErrorCode.CALIBRATION_FILE_INVALID, 'failed'),
+            ('nothing', ErrorCode.CALIBRATION_FILE_NOT_FOUND, 'nothing')):
+        with pytest.raises(PsError, match=reason) as refused:
+            request('load', f'{name}.yaml')
+        assert refused.value.code == code
+    # what was active stays active, and is in every stack
+    assert client.stack(client.capture()).calibration_id == 'good'
+    assert request('save', 'copy.yaml') == 'good'
+    assert read_calibration(files / 'copy.yaml').calibration_id == 'good'
+    listed = client.call(Trigger, 'ring_calibration/list').message.splitlines()
+    assert any(line.startswith('edited.yaml  refused: hash') for line in listed)
 
 
 @pytest.mark.parametrize('stage', [STATE.CAPTURING, STATE.FITTING])

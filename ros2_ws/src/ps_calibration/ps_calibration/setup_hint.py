@@ -2,13 +2,12 @@
 from dataclasses import dataclass
 import math
 
-import numpy as np
-
 from ps_calibration.detection import find_dots
+from ps_calibration.ring_pictures import light_only
 from ps_calibration.ring_target import RingTarget
 from ps_calibration.target_pose import fit_pose
-from ps_head_driver.errors import ErrorCode, PsError
-from ps_head_driver.stack import Panel, Stack
+from ps_head_driver.head_model import CameraGeometry
+from ps_head_driver.stack import Stack
 
 # a target this well in place needs no attention
 _NEAR, _TURNED = 0.002, math.radians(5)
@@ -39,17 +38,16 @@ class SetupHint:
                 f'{tilt:.1f} degrees')
 
 
-def setup_hint(stack: Stack, target: RingTarget) -> SetupHint:
+def setup_hint(stack: Stack, target: RingTarget, camera: CameraGeometry) -> SetupHint:
     """Where the target is, from the picture with all panels on.
 
-    :param stack: with the frames ALL and NONE, and its camera.
-    :raises PsError: CALIBRATION_TARGET_NOT_FOUND; CALIBRATION_BAD_REQUEST without camera or frame.
+    :param stack: frames E, N, W, S, ALL and NONE.
+    :param camera: for pictures of this size.
+    :raises PsError: CALIBRATION_CAPTURE_FAILED for pictures that cannot be used, or
+        CALIBRATION_TARGET_NOT_FOUND, with what to do; CALIBRATION_BAD_REQUEST if a frame is
+        missing.
     """
-    frames = {light.panel: image for light, image in zip(stack.lights, stack.images, strict=True)}
-    if stack.camera is None or not {Panel.ALL, Panel.NONE} <= set(frames):
-        raise PsError(ErrorCode.CALIBRATION_BAD_REQUEST,
-                      'the pictures have no camera intrinsics, or ALL or NONE is missing')
-    picture = frames[Panel.ALL].astype(np.float32) - frames[Panel.NONE].astype(np.float32) / 4
-    pose = fit_pose(find_dots(picture, target, stack.camera), target, stack.camera)
+    *_, picture = light_only(stack)
+    pose = fit_pose(find_dots(picture, target, camera), target, camera)
     x, y, _, turn, tilt_x, tilt_y = (float(number) for number in pose.numbers)
     return SetupHint((-x, -y), -turn, (tilt_x, tilt_y))

@@ -15,6 +15,7 @@ from ps_calibration.calibrate import calibrate
 from ps_calibration.catalogue import list_calibrations
 from ps_calibration.nodes.stack_source import StackSource
 from ps_calibration.report import gather, report, write_report
+from ps_calibration.ring_pictures import common_camera
 from ps_calibration.ring_target import RingTarget, default_target_path, load_target
 from ps_calibration.setup_hint import SetupHint, setup_hint
 from ps_head_driver import ros_support
@@ -256,7 +257,7 @@ class RingCalibration(Node):
                                           on_feedback)
                 if keep is not None:
                     _keep(stack, keep / f'position_{number + 1}')
-                hint = setup_hint(stack, target)
+                hint = setup_hint(stack, target, common_camera([stack], self.head))
                 self._feedback(goal, state.DETECTING, number + 1, len(radii), hint)
                 stacks.append(stack)
         return stacks

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ps_head_driver.errors import PsError
-from ps_head_driver.fake.renderer import Sensor, make_renderer
+from ps_head_driver.fake.renderer import OFF, Sensor, make_renderer
 from ps_head_driver.fake.ring_renderer import _blocked, _enters
 from ps_head_driver.head_model import load_head, nominal_head_path
 
@@ -78,3 +78,16 @@ def test_pictures_of_a_calibration():
     west, east = hollow & (x < -0.006) & (y > 0.002), hollow & (x > 0.006) & (y > 0.002)
     assert share[0][east].mean() < 0.8 * share[0][west].mean()
     assert share[2][west].mean() < 0.8 * share[2][east].mean()
+
+
+def test_long_shadows_of_the_dark_field_do_not_end_on_the_way():
+    east = (1.0, 0.0, 0.0, 0.0)
+    lit, bare = (ring(arguments).radiance(0.5, 1.3, OFF, east)
+                 for arguments in ('', 'defect=no_wall'))
+    seen = lit / bare
+    camera = ring().camera
+    pitch = camera.camera_standoff / camera.fx
+    row = round(camera.cy - 0.0045 / pitch)         # behind the wall, between two slits
+    columns = np.round(camera.cx - np.array([0.0165, 0.0200, 0.0235, 0.0248]) / pitch).astype(int)
+    behind = seen[row, columns]
+    assert behind.max() < 0.5

@@ -259,6 +259,11 @@ def _light(points, free, probes, shadowed, part, axis, lobe, ring, ends, slits):
     """
     out = np.zeros(points.shape[0], np.float32)
     height = ring[2]
+    # the farthest shadow falls straight away from the lowest side of the panel
+    reach = 0.0
+    for e in range(probes.shape[0]):
+        way = math.hypot(probes[e, 0], probes[e, 1]) + ring[1]
+        reach = max(reach, way * height / max(probes[e, 2] - height, 1e-6))
     for k in nb.prange(points.shape[0]):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
         total = 0.0
@@ -267,7 +272,7 @@ def _light(points, free, probes, shadowed, part, axis, lobe, ring, ends, slits):
                                             free[e, 2] - z, axis, lobe)
         # the sides and the middle of the panel tell whether any shadow falls here
         near = False
-        if z < height and math.hypot(x, y) < 2.0 * ring[1]:
+        if z < height and math.hypot(x, y) < ring[1] + reach:
             for e in range(probes.shape[0]):
                 dx, dy = probes[e, 0] - x, probes[e, 1] - y
                 s = (height - z) / (probes[e, 2] - z)

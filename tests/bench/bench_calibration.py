@@ -1,4 +1,4 @@
-"""Ring calibration over random heads and over wrong pictures, against the targets of the project.
+"""Ring calibration: accuracy over random heads and repeatability, against what is wanted.
 
 Run with: python tests/bench/bench_calibration.py --heads 50 --scale 0.5
 """
@@ -8,22 +8,14 @@ import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ps_calibration.calibrate import calibrate
 from ps_calibration.ring_fit import corrected
 from ps_calibration.ring_target import RingTarget, default_target_path, load_target
-from ps_calibration.synthetic import (
-    Bench,
-    errors_of,
-    random_bench,
-    render_stack,
-    solid_of,
-    with_images,
-)
+from ps_calibration.synthetic import errors_of, random_bench, render_stack, solid_of
 from ps_head_driver.head_model import HeadModel, load_head, nominal_head_path
 from ps_head_driver.kinematics import BrightFieldKinematics
-from ps_head_driver.stack import Plane, Stack
+from ps_head_driver.stack import Plane
 
 
 def accuracy(nominal: HeadModel, target: RingTarget, seeds: range, scale: float,
@@ -90,62 +82,11 @@ def repeatability(nominal: HeadModel, target: RingTarget, repeats: int, scale: f
           f'{np.std(directions, axis=0, ddof=1).max():.4f}   target 0.01')
 
 
-def _pictures(stack: Stack, **frames: NDArray) -> Stack:
-    names = ['E', 'N', 'W', 'S', 'ALL', 'NONE']
-    return with_images(stack, [frames.get(name, image)
-                               for name, image in zip(names, stack.images, strict=True)])
-
-
-def _with_specks(stack: Stack) -> Stack:
-    """Dust on the plate: sixty dark specks of a few pixels, the same in all pictures."""
-    random = np.random.default_rng(5)
-    images = [image.copy() for image in stack.images]
-    for _ in range(60):
-        row, column = (int(random.integers(0, n - 4)) for n in stack.shape)
-        for image in images:
-            image[row:row + 3, column:column + 3] //= 3
-    return with_images(stack, images)
-
-
-def confusion(nominal: HeadModel, target: RingTarget, scale: float, tilt: float) -> None:
-    """Print the verdict on good and on wrong pictures."""
-    counts, bench = BrightFieldKinematics(nominal).motor_counts(tilt), random_bench(nominal, 3)
-    slits = target.slits.azimuths
-
-    def ring(at: Bench = bench, **changes: Any) -> Stack:
-        return render_stack(at, nominal, solid_of(target, **changes), counts, scale, 3)
-
-    good = ring()
-    east, north, _, south, all_on, none = good.images
-    cases = {
-        'good': good,
-        'good, 60 specks of dust': _with_specks(good),
-        'ring missing': ring(height=0.0),
-        'turned over': ring(height=0.0, dots=np.array([[0.1, 0.1]])),
-        'wall 25 % too high': ring(height=1.25 * target.height),
-        'radii 0.5 mm too small': ring(radii=(target.inner_radius - 5e-4,
-                                              target.outer_radius - 5e-4)),
-        'middle slit blocked': ring(slits=slits[:2] + slits[3:]),
-        'panel N dead': _pictures(good, N=none),
-        'panels E and N swapped': _pictures(good, E=north, N=east),
-        'frame E saturated': _pictures(
-            good, E=np.clip(east.astype(int) * 3, 0, 255).astype(np.uint8)),
-        'too dark': with_images(good, [image // 20 for image in good.images]),
-        'moved by 2 px in frame S': _pictures(good, S=np.roll(south, 2, axis=1)),
-        'something else': with_images(good, [
-            *[np.full_like(all_on, 100)] * 5, np.zeros_like(none)]),
-    }
-    print(f'{"pictures":26}{"verdict":9}reason')
-    for name, stack in cases.items():
-        result = calibrate([stack], target, nominal)
-        print(f'{name:26}{result.verdict:9}{result.reason}', flush=True)
-
-
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--only',
-                        choices=('accuracy', 'positions', 'repeatability', 'confusion'))
+                        choices=('accuracy', 'positions', 'repeatability'))
     parser.add_argument('--heads', type=int, default=10)
     parser.add_argument('--first', type=int, default=1, help='seed of the first head')
     parser.add_argument('--scale', type=float, default=0.5, help='of the pictures')
@@ -163,8 +104,6 @@ def main() -> None:
         positions(nominal, target, scale)
     if arguments.only in (None, 'repeatability'):
         repeatability(nominal, target, 10, scale, tilt)
-    if arguments.only in (None, 'confusion'):
-        confusion(nominal, target, scale, tilt)
 
 
 if __name__ == '__main__':

@@ -23,7 +23,7 @@ from ps_inspection.session_export import export_session
 from ps_inspection.session_reconstruct import reconstruct_session
 from ps_inspection.session_recovery import recover
 from ps_inspection.session_report import write_report
-from ps_reconstruction.pipeline import reconstruct
+from ps_reconstruction.pipeline import reconstruct, warm_up
 from ps_reconstruction.session_reader import Session
 
 MEMORY_LIMIT = 8 << 30      # so that runaway memory ends a process and not the machine
@@ -120,7 +120,8 @@ def batch(source: str, first: int, count: int) -> tuple[Counter[str], list[str],
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_LIMIT, MEMORY_LIMIT))
     mutator = Mutator(Path(source))
     with tempfile.TemporaryDirectory(prefix='ps_fuzz_', dir=Path(source).parent) as folder:
-        attack(mutator, 0, Path(folder))        # the caches of the first use are not its memory
+        warm_up()       # the compiler's cache is no change outside, nor the attack's memory
+        attack(mutator, 0, Path(folder))
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
         kinds: Counter[str] = Counter()
         wrong = []

@@ -12,9 +12,12 @@ from session_attack import attack
 from session_mutator import Mutator, small_session
 from sessions import record, rendered
 
+from ps_reconstruction.pipeline import warm_up
+
 
 @pytest.fixture(scope='module')
 def mutator(tmp_path_factory: pytest.TempPathFactory) -> Mutator:
+    warm_up()       # the compiler's cache is no change outside
     folder = tmp_path_factory.mktemp('source') / 's'
     return Mutator(small_session(folder, record, rendered(scale=0.025)))
 

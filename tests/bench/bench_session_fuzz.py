@@ -2,7 +2,7 @@
 
 Every input is a real session changed by one of a dozen mutations (tests/session_mutator.py). It is
 read and decoded, and by turns reconstructed, exported, reported and recovered. The number of
-inputs is 3000, or the environment variable PS_BENCH_INPUTS; PS_BENCH_PROCESSES sets how many work.
+inputs is 3000, or the environment variable PS_BENCH_INPUTS; PS_BENCH_PROCESSES of them work.
 """
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -51,6 +51,8 @@ def main() -> None:
                     continue
                 kinds += done
                 wrong += found
+                for line in found[:5]:
+                    console.print(line, markup=False)
                 peak, before = max(peak, most), min(before, least)
                 console.print(f'{kinds.total()} of {inputs}, {len(wrong)} wrong', end='\r')
     outside = [line for line in wrong if ': open ' in line or ': os.' in line]
@@ -61,8 +63,6 @@ def main() -> None:
                   f'{kinds.total() / (time.monotonic() - begin):.0f}')
     console.print(table)
     console.print(', '.join(f'{kind} {count}' for kind, count in sorted(kinds.items())))
-    for line in wrong[:20]:
-        console.print(line, markup=False)
 
 
 if __name__ == '__main__':

@@ -134,10 +134,11 @@ def test_residual_is_that_of_the_redundant_equation() -> None:
 def test_degenerate_lights_are_refused() -> None:
     frames = [np.full((6, 6), 90, np.uint8)] * 3
     flat = np.array([[0.7, 0, 0.7], [-0.7, 0, 0.7], [0, 0, 1.0]])
-    grid, step = constant_lights(flat, (6, 6))
-    with pytest.raises(PsError, match='condition number') as caught:
-        solve(Problem(frames, grid, step, np.ones((3, 1))))
-    assert caught.value.code == ErrorCode.RECONSTRUCTION_DEGENERATE_LIGHTS
+    for lights in (flat, np.eye(3) * 1e-170):
+        grid, step = constant_lights(lights, (6, 6))
+        with pytest.raises(PsError, match='condition number') as caught:
+            solve(Problem(frames, grid, step, np.ones((3, 1))))
+        assert caught.value.code == ErrorCode.RECONSTRUCTION_DEGENERATE_LIGHTS
     grid, step = constant_lights(flat[:2], (6, 6))
     with pytest.raises(PsError) as caught:
         solve(Problem(frames[:2], grid, step, np.ones((2, 1))))

@@ -84,7 +84,8 @@ class Player:
             self.problems = scan.problems
             if sent == before:
                 raise PsError(ErrorCode.SESSION_NOT_A_SESSION,
-                              f'{self._session.file} has nothing to play')
+                              f'{self._session.file} has nothing to play from '
+                              f'{self._options.start:g} s on')
             if not self._options.loop:
                 break
         for publisher in self._publishers.values():

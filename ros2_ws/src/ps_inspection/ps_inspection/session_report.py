@@ -101,7 +101,7 @@ def _caption(entry: Entry, *results: dict[str, Any] | None) -> dict[str, Any]:
     facts = entry.facts
     cr = facts['convergence_radius_m']
     return {
-        'part': facts['part_id'] or facts['stack_id'], 'stack_id': facts['stack_id'],
+        'part': entry.name, 'stack_id': facts['stack_id'],
         'time': entry.received, 'cr_mm': None if cr is None else cr * MILLI,
         'position_mm': [facts[f'pose_{axis}'] * MILLI for axis in 'xyz'],
         'frame': facts['pose_frame'], 'calibration_id': facts['calibration_id'],
@@ -132,7 +132,7 @@ def _content(summary: Summary, parts: list[dict[str, Any]], session: Session) ->
         'title': about.get('session_id') or session.folder.name, 'about': about,
         'start': f'{start:%d %B %Y, %H:%M:%S}', 'duration': _clock(summary.duration),
         'tiles': [
-            ('parts', str(len({entry.facts['part_id'] for entry in entries}))),
+            ('parts', str(len({entry.name for entry in entries}))),
             ('stacks', str(len(entries))), ('faults', str(faults)),
             ('valid pixels, median', _median([r['valid_fraction'] for r in results], '{:.1%}')),
             ('last exposure to result, median', _median(waits, '{:.2f} s'))],
@@ -162,7 +162,7 @@ def _timings(entries: Sequence[Entry]) -> dict[str, Any]:
         values = np.array([durations.get(stage, 0.0) for _, durations in timed]) * MILLI
         rows.append((stage, float(np.median(values)), float(values.max())))
     chart = _columns(
-        [{'part': entry.facts['part_id'] or entry.facts['stack_id'],
+        [{'part': entry.name,
           **{stage: durations.get(stage, 0.0) * MILLI for stage in stages}}
          for entry, durations in timed],
         [(stage, itemgetter(stage)) for stage in stages], stacked=True)
@@ -200,8 +200,7 @@ def _timeline(summary: Summary) -> dict[str, Any]:
         'states': [{'left': begin / whole, 'width': (end - begin) / whole, 'name': state}
                    for (begin, state), end in zip(
                        summary.states, [*begins[1:], whole], strict=False)],
-        'stacks': [{'left': entry.received / whole,
-                    'name': entry.facts['part_id'] or entry.facts['stack_id']}
+        'stacks': [{'left': entry.received / whole, 'name': entry.name}
                    for entry in summary.entries],
         'events': [{'left': event.time / whole, **_event(event)} for event in summary.events],
         'ticks': [{'left': share, 'name': _clock(share * whole)}

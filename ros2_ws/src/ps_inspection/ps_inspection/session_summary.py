@@ -1,6 +1,7 @@
 """What happened in a session: its stacks, results, faults and states, without pictures."""
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from typing import Any
 
 from ps_head_driver.conversions import message_to_stack
@@ -34,6 +35,11 @@ class Entry:
     acquired: float | None = None
     result: dict[str, Any] | None = None
     reconstructed: float | None = None
+
+    @property
+    def name(self) -> str:
+        """The part, or the stack where the part has no name."""
+        return str(self.facts['part_id'] or self.facts['stack_id'])
 
 
 @dataclass(frozen=True)
@@ -157,8 +163,9 @@ class _Summarizer:
 
     def _on_calibration(self, _message: Message, calibration: Any, _time: float) -> None:
         if calibration.calibration_id:
+            created = datetime.fromtimestamp(calibration.created.sec, UTC)
             self._summary.calibrations[calibration.calibration_id] = {
-                'created_s': calibration.created.sec, 'head serial': calibration.head_serial,
+                'created': f'{created:%Y-%m-%d %H:%M} UTC', 'head serial': calibration.head_serial,
                 'target': calibration.target_name,
                 'verdict': ('none', 'OK', 'POOR', 'FAILED')[min(calibration.verdict, 3)],
                 'reason': calibration.verdict_reason}

@@ -10,7 +10,7 @@ from ps_head_driver.head_model import DIRECTIONS
 
 _FAILED_RMS, _POOR_RMS = 0.02, 0.006     # of the shares of light
 _UNLIKELY = 1.7          # corrections, relative to the tolerances they were given
-_Z_SCALE = 0.03          # of the wall's height, before the target is doubted
+_Z_SCALE = 0.03, 0.06    # of the wall's height: doubtful, and certainly another target
 _NO_WALL = 0.4           # of the wall's height, below which there is none
 _BLOCKED = 0.5           # of a slit
 _LIMIT = np.array([0.006, 0.006, 0.006, 0.07, 0.07, 0.25])
@@ -34,8 +34,9 @@ def judge(fit: RingFit, free: RingFit, target: RingTarget, blocked: NDArray) -> 
         azimuth = math.degrees(target.slits.azimuths[int(blocked.argmax())])
         return 'FAILED', (f'the slit at {azimuth:.0f} degrees lets no light through; clean it, or '
                           'check the target file')
-    if abs(height - 1) > _Z_SCALE and _rms(free) < max(0.8 * rms, _POOR_RMS):
-        return ('FAILED' if rms > _FAILED_RMS else 'POOR'), (
+    if abs(height - 1) > _Z_SCALE[0] and _rms(free) < max(0.8 * rms, _POOR_RMS):
+        certain = rms > _FAILED_RMS or abs(height - 1) > _Z_SCALE[1]
+        return ('FAILED' if certain else 'POOR'), (
             f'the wall seems to be {"higher" if height > 1 else "lower"} than the target file '
             f'says (fitted {1e3 * free.height:.2f} mm); is it the right target and file?')
     if rms > _FAILED_RMS:

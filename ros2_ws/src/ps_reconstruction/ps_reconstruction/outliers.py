@@ -21,6 +21,7 @@ MANY = 8                                  # lights, from which on ranks tell mor
 RANKS = (0.3, 0.8)                        # of the first estimate with many lights
 BELIEVED = 0.6                            # fraction of the lit frames kept, the darkest
 LEAST_KEPT = 4
+BISECTIONS = 13                           # of an intensity, to find its rank
 LEAST_COSINE = 0.1                        # to a light; below it a frame counts as shadowed
 LEAST_RATIO, MOST_RATIO = 0.6, 1.5        # observation over prediction
 DARK_RATIO = 0.1                          # of the brightest frame; darker is an attached shadow
@@ -101,35 +102,82 @@ def solve_frames(frames, equations, pixels):    # type: ignore[no-untyped-def]
     solve_equations(equations, pixels)
 
 
-@numba.njit(nogil=True, cache=True)
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def _count_below(frame, middle, count):    # type: ignore[no-untyped-def]
+    """Add 1 to ``count`` where the frame is believed and not brighter than ``middle``."""
+    for x in range(CHUNK):
+        below = (frame[WEIGHT + x] > np.float32(0)) & (frame[U + x] <= middle[x])
+        count[x] += np.float32(1) if below else np.float32(0)
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def find_rank(frames, wanted, limit):    # type: ignore[no-untyped-def]
+    """Intensity of which ``wanted`` (CHUNK,) believed frames are not brighter, into ``limit``.
+
+    By bisection over all pixels at once, to 1e-4 of the brightest: linear in the number of frames
+    and faster than sorting each pixel.
+    """
+    low, high = np.zeros(CHUNK, np.float32), np.zeros(CHUNK, np.float32)
+    middle, count = np.empty(CHUNK, np.float32), np.empty(CHUNK, np.float32)
+    for t in range(frames.shape[0]):
+        frame = frames[t]
+        for x in range(CHUNK):
+            low[x] = min(low[x], frame[U + x])
+            high[x] = max(high[x], frame[U + x])
+    for _ in range(BISECTIONS):
+        for x in range(CHUNK):
+            middle[x] = np.float32(0.5) * (low[x] + high[x])
+            count[x] = 0
+        for t in range(frames.shape[0]):
+            _count_below(frames[t], middle, count)
+        for x in range(CHUNK):
+            enough = count[x] >= wanted[x]
+            bottom, top = low[x], high[x]
+            low[x] = bottom if enough else middle[x]
+            high[x] = middle[x] if enough else top
+    limit[:] = high
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def _keep_between(frame, low, high):    # type: ignore[no-untyped-def]
+    """Set the weight to 0 where the intensity is not above ``low`` and up to ``high``."""
+    for x in range(CHUNK):
+        weight, value = frame[WEIGHT + x], frame[U + x]
+        frame[WEIGHT + x] = weight if (value > low[x]) & (value <= high[x]) else np.float32(0)
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
 def keep_darkest(frames):    # type: ignore[no-untyped-def]
     """Set the weight of all but the darkest frames used of each pixel to 0."""
-    values = np.empty(frames.shape[0], np.float32)
+    wanted, low = np.zeros(CHUNK, np.float32), np.full(CHUNK, -1e30, np.float32)
+    high = np.empty(CHUNK, np.float32)
+    for t in range(frames.shape[0]):
+        for x in range(CHUNK):
+            wanted[x] += np.float32(1) if frames[t, WEIGHT + x] > 0 else np.float32(0)
     for x in range(CHUNK):
-        used = 0
-        for t in range(frames.shape[0]):
-            if frames[t, WEIGHT + x] > 0:
-                values[used] = frames[t, U + x]
-                used += 1
-        if used <= LEAST_KEPT:
-            continue
-        kept = max(LEAST_KEPT, int(BELIEVED * used + 0.5))
-        limit = np.sort(values[:used])[kept - 1]
-        for t in range(frames.shape[0]):
-            if frames[t, U + x] > limit:
-                frames[t, WEIGHT + x] = 0
+        kept = np.floor(np.float32(BELIEVED) * wanted[x] + np.float32(0.5))
+        wanted[x] = min(wanted[x], max(kept, np.float32(LEAST_KEPT)))
+    find_rank(frames, wanted, high)
+    for t in range(frames.shape[0]):
+        _keep_between(frames[t], low, high)
 
 
 @numba.njit(nogil=True, cache=True)
 def middle_ranks(frames):    # type: ignore[no-untyped-def]
     """Weight 1 for the usable frames of middle rank of each pixel."""
     last = frames.shape[0] - 1
-    for x in range(CHUNK):
-        order = np.argsort(frames[:, U + x])
-        for rank in range(frames.shape[0]):
-            inside = RANKS[0] * last < rank < RANKS[1] * last
-            t = order[rank]
-            frames[t, WEIGHT + x] = frames[t, USABLE + x] if inside else np.float32(0)
+    wanted = np.empty(CHUNK, np.float32)
+    low, high = np.empty(CHUNK, np.float32), np.empty(CHUNK, np.float32)
+    for t in range(frames.shape[0]):
+        frames[t, WEIGHT:WEIGHT + CHUNK] = 1
+    wanted[:] = int(RANKS[0] * last) + 1
+    find_rank(frames, wanted, low)
+    wanted[:] = np.ceil(RANKS[1] * last)
+    find_rank(frames, wanted, high)
+    for t in range(frames.shape[0]):
+        frame = frames[t]
+        frame[WEIGHT:WEIGHT + CHUNK] = frame[USABLE:USABLE + CHUNK]
+        _keep_between(frame, low, high)
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')

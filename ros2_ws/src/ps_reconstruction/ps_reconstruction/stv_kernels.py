@@ -66,7 +66,7 @@ def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coeffic
     :param reason: (h, W) uint8 out.
     """
     count, rows, width = values.shape
-    # a stretch shorter than CHUNK leaves the end of these to numbers that nobody reads
+    # the last chunk of a row leaves the end of these to numbers that nobody reads
     frames = np.empty((count, FRAME_SIZE), np.float32)
     pixels, system = np.empty(PIXEL_SIZE, np.float32), np.empty(EQUATION_SIZE, np.float32)
     look, gain = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.float32)
@@ -75,17 +75,14 @@ def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coeffic
     for y in range(rows):
         i = (top + y) // step
         fy = np.float32(top + y - i * step) / np.float32(step)
-        end = 0
-        while end < width:
-            begin = end
-            j = begin // step
-            end = min(begin + CHUNK, (j + 1) * step, width)
+        for begin in range(0, width, CHUNK):
+            end = min(begin + CHUNK, width)
             n = end - begin
             if not mask[y, begin:end].any():
                 continue
             system[:], sums[:], flags[:], pixels[:] = 0, 0, 0, 0
             for m in range(3):
-                interpolate(view[m], i, j, fy, begin, step, look[m * CHUNK:])
+                interpolate(view[m], i, fy, begin, step, look[m * CHUNK:])
             for t in range(count):
                 frame = frames[t]
                 frame[U:U + CHUNK] = 1
@@ -97,12 +94,11 @@ def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coeffic
                             frame[USABLE + x] = 0
                             flags[x] |= np.int32(SATURATED)
                 if flat.size:
-                    interpolate(flat[t], i, j, fy, begin, step, gain)
+                    interpolate(flat[t], i, fy, begin, step, gain)
                     for x in range(CHUNK):
                         frame[U + x] *= gain[x]
                 for m in range(3):
-                    interpolate(lights[t, m], i, j, fy, begin, step,
-                                frame[D0 + m * CHUNK:])
+                    interpolate(lights[t, m], i, fy, begin, step, frame[D0 + m * CHUNK:])
                 normalise(frame, look, sums)
                 add_equations(frame, system)
             solve_equations(system, pixels)
@@ -138,14 +134,22 @@ def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coeffic
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def interpolate(grid, i, j, fy, begin, step, out):    # type: ignore[no-untyped-def]
-    """One quantity of the nodes, (gh, gw), along CHUNK pixels of a row, cell (i, j)."""
-    left = grid[i, j] + fy * (grid[i + 1, j] - grid[i, j])
-    right = grid[i, j + 1] + fy * (grid[i + 1, j + 1] - grid[i, j + 1])
-    slope = (right - left) / np.float32(step)
-    left += slope * np.float32(begin - j * step)
-    for x in range(CHUNK):
-        out[x] = left + slope * np.float32(x)
+def interpolate(grid, i, fy, begin, step, out):    # type: ignore[no-untyped-def]
+    """One quantity of the nodes, (gh, gw), along CHUNK pixels of a row below node row i.
+
+    Beyond the last node it is extrapolated: what lies past the picture's edge is read by nobody.
+    """
+    x = 0
+    while x < CHUNK:
+        j = min((begin + x) // step, grid.shape[1] - 2)
+        end = min((j + 1) * step - begin, CHUNK) if j < grid.shape[1] - 2 else CHUNK
+        left = grid[i, j] + fy * (grid[i + 1, j] - grid[i, j])
+        right = grid[i, j + 1] + fy * (grid[i + 1, j + 1] - grid[i, j + 1])
+        slope = (right - left) / np.float32(step)
+        left -= slope * np.float32(j * step - begin)
+        for k in range(x, end):
+            out[k] = left + slope * np.float32(k)
+        x = end
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')

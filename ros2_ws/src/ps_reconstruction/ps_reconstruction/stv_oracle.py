@@ -89,8 +89,9 @@ def pixel(u: NDArray, d: NDArray, h: NDArray, usable: NDArray, g: NDArray, decid
 
 
 def _first_of_many(u: NDArray, d: NDArray, usable: NDArray) -> tuple[NDArray, NDArray]:
-    rank = np.argsort(np.argsort(u)) / (len(u) - 1)
-    keep = usable & (rank > RANKS[0]) & (rank < RANKS[1])
+    last, ordered = len(u) - 1, np.sort(u)
+    low, high = ordered[int(RANKS[0] * last)], ordered[int(np.ceil(RANKS[1] * last)) - 1]
+    keep = usable & (u > low) & (u <= high)
     g = _fit(d, u, keep)
     for _ in range(3):
         predicted = d @ g

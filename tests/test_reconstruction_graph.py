@@ -102,8 +102,20 @@ def peer(tmp_path_factory: pytest.TempPathFactory, ros_domain: int) -> Iterator[
         peer.close()
 
 
+def test_nothing_is_computed_that_nobody_listens_to(peer: Peer) -> None:
+    info = peer.reconstruct(stack_to_message(make_stack('unheard')))
+    assert info.success
+    assert {d.stage for d in info.durations} == {'convert', 'lights', 'normals', 'publish'}
+    peer.listen('slope/image', Image)
+    time.sleep(1.0)       # discovery of the new subscription
+    info = peer.reconstruct(stack_to_message(make_stack('slope only')))
+    assert {d.stage for d in info.durations} == {
+        'convert', 'lights', 'normals', 'slope', 'publish'}
+
+
 def test_images_are_those_of_the_pipeline(peer: Peer) -> None:
-    for topic in ('slope', 'normal', 'albedo', 'height', 'curvature', 'shape', 'confidence'):
+    for topic in ('slope', 'normal', 'albedo', 'height', 'curvature', 'shape', 'confidence',
+                  'reason'):
         peer.listen(f'{topic}/image', Image)
         peer.listen(f'{topic}/camera_info', CameraInfo)
     peer.listen('normal/preview', Image)
@@ -120,7 +132,8 @@ def test_images_are_those_of_the_pipeline(peer: Peer) -> None:
     expected = reconstruct(stack, Options())
     for name, encoding in {
             'slope': '32FC2', 'normal': '32FC3', 'albedo': '32FC1', 'height': '32FC1',
-            'curvature': '32FC1', 'shape': 'mono8', 'confidence': 'mono8'}.items():
+            'curvature': '32FC1', 'shape': 'mono8', 'confidence': 'mono8',
+            'reason': 'mono8'}.items():
         image = peer.heard[f'{name}/image'][-1]
         assert image.encoding == encoding
         assert image.header.stamp == message.header.stamp
@@ -163,6 +176,10 @@ def test_parameters_hold_from_the_next_stack_on(peer: Peer) -> None:
     assert peer.set('method', text('stv')).successful
     assert peer.reconstruct(stack_to_message(make_stack('robust'))).method == 'stv'
     assert peer.set('method', text('ls')).successful
+    refused = peer.set('patch', ParameterValue(
+        type=ParameterType.PARAMETER_INTEGER, integer_value=4))
+    assert not refused.successful
+    assert 'odd' in refused.reason
     refused = peer.set('method', text('guess'))
     assert not refused.successful
     assert 'ls, stv' in refused.reason

@@ -20,20 +20,14 @@ from ps_head_driver import ros_support
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_interfaces import msg as ps
 from ps_interfaces import srv
-
-# output: topic and quality of service are those of the reconstruction node
-OUTPUT_TOPICS = {
-    'slope': 'slope/image', 'normal': 'normal/image', 'albedo': 'albedo/image',
-    'height': 'height/image', 'curvature': 'curvature/image', 'shape': 'shape/image',
-    'confidence': 'confidence/image', 'preview': 'normal/preview',
-}
+from ps_reconstruction.conversions import IMAGE_TOPICS
 
 
 class CellClient:
     """Blocking access to a cell; use it as a context manager.
 
     :param namespace: of the cell.
-    :param outputs: keys of OUTPUT_TOPICS to receive; the reconstruction computes only what
+    :param outputs: keys of IMAGE_TOPICS to receive; the reconstruction computes only what
         somebody receives.
     """
 
@@ -59,7 +53,7 @@ class CellClient:
         subscribe(ps.ReconstructionInfo, 'reconstruction_info', self._keeper(self.info), latched)
         for output in outputs:
             self.images[output] = {}
-            subscribe(Image, OUTPUT_TOPICS[output], self._image_keeper(output), reliable)
+            subscribe(Image, IMAGE_TOPICS[output], self._image_keeper(output), reliable)
         self._thread = threading.Thread(target=self._spin, name='ps_cell_client', daemon=True)
         self._thread.start()
 
@@ -109,7 +103,7 @@ class CellClient:
         :raises PsError: RECONSTRUCTION_TIMEOUT.
         """
         deadline = time.monotonic() + timeout
-        while not all(self.node.count_publishers(OUTPUT_TOPICS[name]) for name in self.images):
+        while not all(self.node.count_publishers(IMAGE_TOPICS[name]) for name in self.images):
             if time.monotonic() > deadline:
                 raise PsError(ErrorCode.RECONSTRUCTION_TIMEOUT,
                               f'nobody publishes the output images after {timeout:g} s; is the '

@@ -15,7 +15,7 @@ from ps_reconstruction.pipeline import Reconstruction
 IMAGE_TOPICS = {
     'slope': 'slope/image', 'normal': 'normal/image', 'albedo': 'albedo/image',
     'height': 'height/image', 'curvature': 'curvature/image', 'shape': 'shape/image',
-    'confidence': 'confidence/image', 'preview': 'normal/preview'}
+    'confidence': 'confidence/image', 'reason': 'reason/image', 'preview': 'normal/preview'}
 
 
 def quantity_to_message(result: Reconstruction, quantity: str, header: Any) -> Image:

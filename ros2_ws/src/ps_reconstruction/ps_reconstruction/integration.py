@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 import scipy.fft
 
+from ps_reconstruction import backend
 from ps_reconstruction.bands import core_count, for_bands
 
 BAND = 32
@@ -85,7 +86,7 @@ def poisson(du: NDArray[np.float32], dv: NDArray[np.float32]) -> NDArray[np.floa
     :param dv: (H, W) derivative along the rows axis.
     :returns: (H, W) float32 with zero mean.
     """
-    return solve_poisson(divergence(du, dv))
+    return backend.kernel('solve_poisson', solve_poisson)(divergence(du, dv))
 
 
 def divergence(du: NDArray[np.float32], dv: NDArray[np.float32]) -> NDArray[np.float32]:

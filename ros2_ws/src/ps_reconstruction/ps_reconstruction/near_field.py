@@ -111,16 +111,20 @@ def check(stack: Stack) -> Stack:
 
 def photometric_problem(
     stack: Stack, near_field: bool = True, saturation: float = 0.98,
-    height: NDArray[np.float64] | None = None,
+    height: NDArray[np.float64] | None = None, bits: int = 0,
 ) -> Problem:
     """What the solvers need, from a stack that passed `check`.
 
     :param near_field: light vectors per node; False takes those of the plane's centre for all.
     :param saturation: share of full scale from which on a value counts as saturated.
     :param height: (gh, gw) heights of the surface above the plane at the nodes, m.
+    :param bits: of integer pixel values that count; 0: all of the pixel type.
     """
     shape = stack.shape
-    dtype = str(stack.images[0].dtype)
+    dtype = stack.images[0].dtype
+    full_scale = FULL_SCALE[str(dtype)]
+    if bits and dtype != np.float32:
+        full_scale = min(full_scale, 2.0 ** bits - 1)
     step = node_step(shape)
     gh, gw = grid_size(shape, step)
     channels = 3 if stack.images[0].ndim == 3 else 1
@@ -135,7 +139,7 @@ def photometric_problem(
     flat = _flat_at_nodes(stack, step) if stack.gain_maps else None
     centre = np.array([[0.0, 0.0, stack.plane.offset / normal[2]]])
     for t, light in enumerate(stack.lights):
-        scale[t] = 1 / (FULL_SCALE[dtype] * light.exposure_scale)
+        scale[t] = 1 / (full_scale * light.exposure_scale)
         # a distant light's colour belongs to the frame; a panel's brightness to its light vector
         known = replace(light, intensity=1.0) if light.distant else light
         if light.distant:
@@ -159,7 +163,7 @@ def photometric_problem(
         scale=scale, clip=1.0 if coloured else float('inf'), reciprocal_flat=flat,
         ambient=None if stack.ambient is None else np.ascontiguousarray(stack.ambient),
         mask=None if stack.mask is None else np.ascontiguousarray(stack.mask, bool),
-        saturation=saturation * FULL_SCALE[dtype], view=view)
+        saturation=saturation * full_scale, view=view)
 
 
 def surface_heights(stack: Stack, rounds: int, tolerance: float = 2e-5

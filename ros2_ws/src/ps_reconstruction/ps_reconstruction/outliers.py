@@ -333,14 +333,15 @@ def estimate(frames, coefficients, rounds, rejecting, reflecting, equations, pix
 
 
 @numba.njit(nogil=True, cache=True)
-def estimate_samples(u, d, h, usable, coefficients, rounds, rejecting, reflecting, g):    # type: ignore[no-untyped-def]
-    """`estimate` for planes: u, usable (T, P), d, h (T, 3, P), g (3, P) in and out."""
-    count, samples = u.shape
+def estimate_samples(u, d, h, usable, coefficients, rounds, rejecting, reflecting, g,    # type: ignore[no-untyped-def]
+                     first, last):
+    """`estimate` for samples ``first`` to ``last``: u, usable (T, P), d, h (T, 3, P), g (3, P)."""
+    count = len(u)
     frames = np.empty((count, FRAME_SIZE), np.float32)
     equations, pixels = np.empty(EQUATION_SIZE, np.float32), np.empty(PIXEL_SIZE, np.float32)
-    for begin in range(0, samples, CHUNK):
+    for begin in range(first, last, CHUNK):
         for x in range(CHUNK):
-            p = min(begin + x, samples - 1)
+            p = min(begin + x, last - 1)
             for t in range(count):
                 frame = frames[t]
                 frame[U + x], frame[USABLE + x], frame[E + x] = u[t, p], usable[t, p], 1
@@ -350,6 +351,6 @@ def estimate_samples(u, d, h, usable, coefficients, rounds, rejecting, reflectin
             for m in range(3):
                 pixels[m * CHUNK + x] = g[m, p]
         estimate(frames, coefficients, rounds, rejecting, reflecting, equations, pixels)
-        for x in range(min(CHUNK, samples - begin)):
+        for x in range(min(CHUNK, last - begin)):
             for m in range(3):
                 g[m, begin + x] = pixels[m * CHUNK + x]

@@ -17,15 +17,16 @@ from ps_reconstruction.near_field import (
     stack_rays,
     surface_heights,
 )
-from ps_reconstruction.problem import Problem, Solution
+from ps_reconstruction.problem import MAX_PATCH, Problem, Solution
 from ps_reconstruction.surface import Roughness
 from ps_reconstruction.weighted_integration import integrate
 
 METHODS = ('ls', 'stv')
 WHOLE = 0.98                  # share of valid pixels from which the fast integration is right
 FORMS = ('auto', 'none', 'plane', 'slow')
-OUTPUTS = ('normal', 'slope', 'albedo', 'height', 'curvature', 'shape', 'confidence', 'preview',
-           'roughness')
+TRUSTS = ('auto', 'least_squares', 'rejection', 'reflectance')
+OUTPUTS = ('normal', 'slope', 'albedo', 'height', 'curvature', 'shape', 'confidence', 'reason',
+           'preview', 'roughness')
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,9 @@ class Options:
     """How to reconstruct; the defaults suit quasi-planar machined parts.
 
     :param method: 'ls' or 'stv'.
+    :param trust: how far 'stv' departs from least squares: 'auto' chooses for every stack, the
+        other TRUSTS fix it.
+    :param patch: width of the neighbourhood of 'stv', px, odd; 1 for none.
     :param near_field: light vectors per pixel from the panel geometry.
     :param height_rounds: alternations of height and lighting, 0 for none.
     :param careful: integrate with confidence weights and height steps. Else by cosine transform,
@@ -40,6 +44,8 @@ class Options:
     :param form: what is removed from the height: 'none', 'plane' (the one that fits best), 'slow'
         (all slow form; the picture's longer side / 16) or 'auto': 'slow' where the lights are
         assumed, so that their error is not taken for form, else 'none'.
+    :param bits: of a pixel value that count, for cameras with 10, 12 or 14 bits in 16 (lower
+        ones); 0: all of the pixel type.
     :param saturation: share of full scale that counts as saturated.
     :param smoothness: sigma of the smoothing of shape and curvature, px.
     :param flattening: length beyond which form is removed from the shape, px; 0 takes a 150th of
@@ -51,10 +57,13 @@ class Options:
     """
 
     method: str = 'ls'
+    trust: str = 'auto'
+    patch: int = 5
     near_field: bool = True
     height_rounds: int = 2
     careful: bool = False
     form: str = 'auto'
+    bits: int = 0
     saturation: float = 0.98
     smoothness: float = 1.0
     flattening: float = 0.0
@@ -67,7 +76,7 @@ class Options:
         def refuse(name: str, what: str) -> None:
             raise PsError(ErrorCode.RECONSTRUCTION_BAD_PARAMETER,
                           f'{name}: {getattr(self, name)!r} {what}')
-        for name, choices in (('method', METHODS), ('form', FORMS)):
+        for name, choices in (('method', METHODS), ('trust', TRUSTS), ('form', FORMS)):
             if getattr(self, name) not in choices:
                 refuse(name, f'is not one of {", ".join(choices)}')
         for name in ('smoothness', 'flattening', 's_filter', 'pixel_pitch', 'height_rounds'):
@@ -76,6 +85,10 @@ class Options:
         for name in ('contrast', 'l_filter', 'saturation'):
             if not 0 < getattr(self, name) < float('inf'):
                 refuse(name, 'must be positive')
+        if self.patch % 2 == 0 or not 1 <= self.patch <= MAX_PATCH:
+            refuse('patch', f'is not an odd number from 1 to {MAX_PATCH}')
+        if self.bits and not 8 <= self.bits <= 16:
+            refuse('bits', 'is neither 0 nor 8 to 16')
 
 
 @dataclass
@@ -134,17 +147,17 @@ def reconstruct(stack: Stack, options: Options | None = None,
         heights = None
         if near:
             heights, _ = surface_heights(stack, options.height_rounds)
-        problem = photometric_problem(stack, near, options.saturation, heights)
+        problem = photometric_problem(stack, near, options.saturation, heights, options.bits)
     with _timed(timings, 'normals'):
         careful = options.careful and 'height' in wanted
-        solution = _solve(problem, options, 'confidence' in wanted or careful)
+        quality = careful or not wanted.isdisjoint({'confidence', 'reason'})
+        solution = _solve(problem, options, quality)
         valid = np.isfinite(solution.normal[..., 2])
     rays = stack_rays(stack, options.pixel_pitch)
     pitch = _pitch(stack, options)
     result = Reconstruction(
         options.method, near, stack.camera is not None or options.pixel_pitch > 0,
-        solution.normal, valid, pitch, reason=solution.reason,
-        residual_rms=solution.residual_rms, timings=timings)
+        solution.normal, valid, pitch, residual_rms=solution.residual_rms, timings=timings)
     # pixels that the mask leaves out are no failures
     used = valid.size if stack.mask is None else np.count_nonzero(stack.mask)
     result.valid_fraction = np.count_nonzero(valid) / used
@@ -152,6 +165,8 @@ def reconstruct(stack: Stack, options: Options | None = None,
         result.albedo = solution.albedo
     if 'confidence' in wanted:
         result.confidence = solution.confidence
+    if 'reason' in wanted:
+        result.reason = solution.reason
     if 'slope' in wanted:
         with _timed(timings, 'slope'):
             result.slope = surface.slope(solution.normal)
@@ -191,7 +206,8 @@ def _timed(timings: dict[str, float], stage: str) -> Iterator[None]:
 def _solve(problem: Problem, options: Options, quality: bool) -> Solution:
     if options.method == 'stv':
         from ps_reconstruction import stv  # loaded only when it is used
-        return stv.solve(problem, quality=quality)
+        trust = None if options.trust == 'auto' else stv.Trust[options.trust.upper()]
+        return stv.solve(problem, stv.StvOptions(patch=options.patch, trust=trust), quality)
     return least_squares.solve(problem, quality=quality)
 
 

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 GREY_WEIGHTS = (0.2989, 0.587, 0.114)    # of R, G, B (ITU-R BT.601; as DiLiGenT evaluations use)
 
+MAX_PATCH = 15                           # pixels, of the neighbourhoods of the robust solver
+
 # Bits of the reason mask
 SHADOW, HIGHLIGHT, SATURATED, FEW_LIGHTS, MASKED = 1, 2, 4, 8, 16
 

@@ -104,7 +104,7 @@ def add_equation(a, b, direction, weight, value):    # type: ignore[no-untyped-d
 
 @numba.njit(nogil=True, cache=True)
 def normal_equations(values, directions, halves, usable, scaled_normals, coefficients,    # type: ignore[no-untyped-def]
-                     darkest, low, high, huber):
+                     darkest, low, high, huber, first, last):
     """Information matrix (10, 10) and right side (10,) for a step of the coefficients.
 
     :param values: (T, P) intensity per irradiance of sample pixels.
@@ -112,16 +112,16 @@ def normal_equations(values, directions, halves, usable, scaled_normals, coeffic
     :param usable: (T, P), 0 for frames that must not be used.
     :param scaled_normals: (3, P).
     :param darkest: least n.l; low, high: limits of value over prediction; huber: threshold on the
-        residual relative to |g|.
+        residual relative to |g|. Samples ``first`` to ``last`` are added up.
     """
-    count, pixels = values.shape
+    count = len(values)
     information, right = np.zeros((TERMS, TERMS)), np.zeros(TERMS)
     terms = np.empty((count, TERMS))
     jacobian = np.empty((count, 3))
     weight, residual = np.empty(count), np.empty(count)
     a, b, x = np.empty(6), np.empty(3), np.empty(3)
     cross, projection, column = np.empty((3, TERMS)), np.empty((3, TERMS)), np.empty(3)
-    for p in range(pixels):
+    for p in range(first, last):
         g = scaled_normals[:, p]
         length = np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
         if not length > 0:

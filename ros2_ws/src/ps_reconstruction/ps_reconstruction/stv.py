@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_reconstruction import reflectance
+from ps_reconstruction import backend, reflectance
 from ps_reconstruction.bands import for_bands
 from ps_reconstruction.least_squares import check_lights, empty_solution
 from ps_reconstruction.outliers import (
@@ -33,12 +33,14 @@ from ps_reconstruction.outliers import (
     MOST_RATIO,
     estimate_samples,
 )
-from ps_reconstruction.problem import GREY_WEIGHTS, Problem, Solution
-from ps_reconstruction.stv_kernels import MAX_PATCH, combine_patches, finish, solve_pixels
+from ps_reconstruction.problem import GREY_WEIGHTS, MAX_PATCH, Problem, Solution
+from ps_reconstruction.stv_kernels import combine_patches, finish, solve_pixels
 
 BAND, LEAST_BAND = 48, 16     # rows per band; fewer for many lights, to bound the memory
 BAND_FRAMES = 768             # rows times lights of a band
-SAMPLES = 4000                # pixels that the plan looks at
+SAMPLES, LEAST_SAMPLES = 4000, 1000     # pixels that the plan looks at, few or many lights
+SAMPLE_FRAMES = 64000         # pixels times lights of the plan
+SAMPLE_BAND = 512             # samples per core and call
 ROUNDS = 5                    # of the reflectance fit
 NOT_LAMBERTIAN = 0.04         # median misfit of LS from which few lights tell nothing more
 QUANTILE = 0.75               # of the misfits, by which the estimates are compared
@@ -97,19 +99,19 @@ class Plan:
 
 
 def solve(problem: Problem, options: StvOptions | None = None, quality: bool = True,
-          out: Solution | None = None) -> Solution:
+          out: Solution | None = None, decided: Plan | None = None) -> Solution:
     """Normals and albedo by robust regression.
 
     :param quality: also compute confidence, reason and residual_rms.
     :param out: arrays to fill instead of new ones; must fit the problem.
-    :raises PsError: RECONSTRUCTION_TOO_FEW_LIGHTS, RECONSTRUCTION_DEGENERATE_LIGHTS,
-        RECONSTRUCTION_BAD_PARAMETER.
+    :param decided: reflectance and trust, for instance of a good part; made by `plan` if None.
+    :raises PsError: RECONSTRUCTION_TOO_FEW_LIGHTS, RECONSTRUCTION_DEGENERATE_LIGHTS.
     """
     options = options or StvOptions()
     check_lights(problem.lights)
     result = out if out is not None else empty_solution(problem, quality)
     height, width = problem.shape
-    decided = plan(problem, options)
+    decided = decided or plan(problem, options)
     reject, reflect = decided.trust > Trust.LEAST_SQUARES, decided.trust == Trust.REFLECTANCE
     coefficients = decided.coefficients.astype(np.float32)
     lights = _planes(problem.lights)
@@ -118,7 +120,10 @@ def solve(problem: Problem, options: StvOptions | None = None, quality: bool = T
             else _planes(problem.reciprocal_flat))
     spatial = _spatial(options)
     radius = options.patch // 2
-    band = max(LEAST_BAND, min(BAND, BAND_FRAMES // problem.count))
+    band = backend.band_rows(height, max(LEAST_BAND, min(BAND, BAND_FRAMES // problem.count)))
+    solve_band = backend.kernel('solve_pixels', solve_pixels)
+    combine_band = backend.kernel('combine_patches', combine_patches)
+    finish_band = backend.kernel('finish', finish)
     edge = options.edge_tolerance * decided.scatter
 
     def work(first: int, last: int) -> tuple[float, float, int]:
@@ -131,19 +136,19 @@ def solve(problem: Problem, options: StvOptions | None = None, quality: bool = T
         shading = np.zeros((problem.count if problem.colour else 0, *shape), np.float32)
         tally = np.zeros((4, *shape), np.float32)
         reason = np.zeros(shape, np.uint8)
-        solve_pixels(grey, saturated, mask, lights, view, flat, problem.step, top,
-                     coefficients, options.rounds, reject, reflect, reference, scaled, equations,
-                     shading, tally, reason)
+        solve_band(grey, saturated, mask, lights, view, flat, problem.step, top, coefficients,
+                   options.rounds, reject, reflect, reference, scaled, equations, shading, tally,
+                   reason)
         inner = slice(first - top, last - top)
         if not reject:
             solved = reference[:, inner]
         else:
             solved = np.empty((3, last - first, width), np.float32)
-            combine_patches(reference, scaled, equations, spatial, edge, options.ridge,
-                            first - top, solved)
+            combine_band(reference, scaled, equations, spatial, edge, options.ridge, first - top,
+                         solved)
         length = np.empty((last - first, width), np.float32)
         confidence = np.empty((last - first, width), np.uint8)
-        sums: tuple[float, float, int] = finish(
+        sums: tuple[float, float, int] = finish_band(
             solved, reference[:, inner], tally[:, inner], mask[inner], problem.count,
             result.normal[first:last], length, confidence, reason[inner])
         if problem.colour:
@@ -179,17 +184,22 @@ def plan(problem: Problem, options: StvOptions | None = None) -> Plan:
 
     def estimated(coefficients: NDArray, trust: Trust) -> NDArray[np.float32]:
         g = g_ls.copy()
-        estimate_samples(u, d, h, usable, coefficients.astype(np.float32), options.rounds,
-                         trust > Trust.LEAST_SQUARES, trust == Trust.REFLECTANCE, g)
+        single = coefficients.astype(np.float32)
+        for_bands(g.shape[1], SAMPLE_BAND, lambda first, last: estimate_samples(
+            u, d, h, usable, single, options.rounds, trust > Trust.LEAST_SQUARES,
+            trust == Trust.REFLECTANCE, g, first, last))
         return g
 
     g_first = estimated(lambertian, Trust.REJECTION)
     coefficients, g = lambertian, g_first
     exact = [a.astype(np.float64) for a in (u, d, h)]
     for _ in range(ROUNDS):
-        information, right = reflectance.normal_equations(
-            exact[0], exact[1], exact[2], usable, g.astype(np.float64), coefficients, LEAST_COSINE,
-            LEAST_RATIO, MOST_RATIO, HUBER)
+        present, c = g.astype(np.float64), coefficients
+        parts = for_bands(g.shape[1], SAMPLE_BAND, lambda first, last, present=present, c=c:    # type: ignore[misc]
+                          reflectance.normal_equations(
+            exact[0], exact[1], exact[2], usable, present, c, LEAST_COSINE, LEAST_RATIO,
+            MOST_RATIO, HUBER, first, last))
+        information, right = (sum(part[i] for part in parts) for i in (0, 1))
         coefficients = reflectance.improved(coefficients, information, right)
         g = estimated(coefficients, Trust.REFLECTANCE)
     misfit_ls = _misfit(u, d, h, g_ls, lambertian)
@@ -225,18 +235,19 @@ def _planes(grid: NDArray) -> NDArray[np.float32]:
 
 
 def _samples(problem: Problem) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
-    """At most about SAMPLES pixels spread over the mask.
+    """Some thousand pixels spread over the mask.
 
     :returns: u (T, P), d (T, 3, P), h (T, 3, P), usable (T, P) 0 or 1, g_ls (3, P), float32.
     """
     height, width = problem.shape
+    most = max(LEAST_SAMPLES, min(SAMPLES, SAMPLE_FRAMES // problem.count))
     if problem.mask is None:
         # an odd stride off the width walks through all columns
-        stride = max(1, height * width // SAMPLES) | 1
+        stride = max(1, height * width // most) | 1
         index = np.arange(0, height * width, stride + 2 * (width % stride == 0))
     else:
         index = np.flatnonzero(problem.mask)
-        index = index[::max(1, len(index) // SAMPLES)]
+        index = index[::max(1, len(index) // most)]
     row, column = np.divmod(index, width)
     nodes = (row / problem.step, column / problem.step)
     lights = _interpolate(problem.lights, *nodes)

@@ -1,7 +1,7 @@
 """The compiled loops of the robust regression: arrays in, arrays out, no threads, no state.
 
-One function per kernel; a GPU version would replace `solve_pixels`, `combine_patches` and
-`finish` one by one. All planes are float32 and pixel-last, (..., h, W).
+One function per kernel; a GPU version can replace `solve_pixels`, `combine_patches` and
+`finish` one by one, see backend.py. All planes are float32 and pixel-last, (..., h, W).
 """
 import numba
 import numpy as np
@@ -34,7 +34,14 @@ from ps_reconstruction.outliers import (
     estimate,
     solve_equations,
 )
-from ps_reconstruction.problem import FEW_LIGHTS, HIGHLIGHT, MASKED, SATURATED, SHADOW
+from ps_reconstruction.problem import (
+    FEW_LIGHTS,
+    HIGHLIGHT,
+    MASKED,
+    MAX_PATCH,
+    SATURATED,
+    SHADOW,
+)
 
 BRIGHT_MARGIN = 0.1                       # of |g|: brighter than Lambert's law by this is gloss
 NOISE = 0.005                             # relative error of an intensity that is always there
@@ -43,7 +50,6 @@ ERROR_HALF = 0.04                         # expected error of a unit normal that
 # Sums over the frames of a chunk: squared residuals, intensity, frames used, misfit
 SQUARES, LIGHT, USED, MISFIT = 0, CHUNK, 2 * CHUNK, 3 * CHUNK
 SUMS_SIZE = 4 * CHUNK
-MAX_PATCH = 15
 SIDE = CHUNK + MAX_PATCH - 1                # of a chunk with its neighbours
 
 

@@ -10,7 +10,7 @@ from ps_head_driver.head_model import CameraGeometry
 from ps_head_driver.stack import Light, Panel, Plane, Stack, angular_error_deg
 from ps_reconstruction.near_field import photometric_problem
 from ps_reconstruction.pipeline import OUTPUTS, Options, reconstruct
-from ps_reconstruction.problem import expand
+from ps_reconstruction.problem import SATURATED, expand
 
 
 def plate(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -124,6 +124,32 @@ def test_only_what_is_asked_for_is_computed(render: Callable) -> None:
     assert reconstruct(stack, outputs=set()).height is None
 
 
+def test_cameras_with_fewer_bits_than_the_pixel_type(render: Callable) -> None:
+    """12 bits in 16: the scale of the albedo and the saturated level are those of 12 bits."""
+    stack, normal, _ = render(dome)
+    float_albedo = reconstruct(stack, outputs={'albedo'}).albedo
+    twelve = replace(stack, images=[np.rint(i * 4095).astype(np.uint16) for i in stack.images])
+    twelve.images[2][40:44, 50:60] = 4095
+    result = reconstruct(twelve, Options(bits=12), {'albedo', 'reason'})
+    assert angular_error_deg(result.normal, normal).mean() < 0.1
+    assert np.nanmedian(result.albedo / float_albedo) == pytest.approx(1, rel=1e-3)
+    assert result.reason is not None
+    assert (result.reason[40:44, 50:60] & SATURATED).all()
+    assert not (result.reason[60:] & SATURATED).any()
+
+
+def test_trust_can_be_fixed(render: Callable) -> None:
+    stack, normal, _ = render(dome)
+    stack.images[0][60:64, 70:74] *= 0.03       # a cast shadow
+    fixed = reconstruct(stack, Options(method='stv', trust='least_squares'), {'normal'}).normal
+    plain = reconstruct(stack, outputs={'normal'}).normal
+    np.testing.assert_allclose(fixed, plain, atol=2e-3)
+    robust = reconstruct(stack, Options(method='stv', trust='rejection', patch=1), {'normal'})
+    errors = [angular_error_deg(n, normal)[60:64, 70:74].max() for n in (plain, robust.normal)]
+    assert errors[0] > 10
+    assert errors[1] < 0.5
+
+
 def test_bit_identical_on_repeat(render: Callable) -> None:
     stack, _, _ = render(dome)
     first, second = reconstruct(stack), reconstruct(stack)
@@ -181,7 +207,7 @@ def test_bad_stacks_are_refused_with_a_reason(
 
 @pytest.mark.parametrize('change', [
     {'method': 'magic'}, {'form': 'cube'}, {'contrast': 0.0}, {'smoothness': -1.0},
-    {'l_filter': float('nan')}])
+    {'l_filter': float('nan')}, {'trust': 'blind'}, {'patch': 4}, {'patch': 17}, {'bits': 7}])
 def test_bad_options_are_refused(change: dict) -> None:
     with pytest.raises(PsError, match=next(iter(change))) as caught:
         Options(**change)

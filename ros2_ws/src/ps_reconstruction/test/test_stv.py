@@ -166,6 +166,26 @@ def test_saturated_frames_do_not_count() -> None:
     assert errors(solution.normal, normal, mask & (left >= 4)).max() < 0.5
 
 
+def test_fewer_than_three_frames_left_are_named() -> None:
+    normal, mask = sphere(32, limit=0.4)
+    problem = render(normal, mask, lights_of(4))
+    for frame in problem.frames[:2]:
+        frame[12:16, 12:16] = 2.0
+    solution = stv.solve(dataclasses.replace(problem, saturation=2.0),
+                         StvOptions(trust=Trust.REJECTION))
+    assert solution.reason is not None
+    assert (solution.reason[12:16, 12:16] == FEW_LIGHTS | SATURATED).all()
+    assert not (solution.reason[20:, 20:][mask[20:, 20:]] & FEW_LIGHTS).any()
+
+
+def test_ambient_light_is_subtracted() -> None:
+    normal, mask = sphere(48)
+    clean = render(normal, mask, lights_of(4), gloss=0.4)
+    room = (0.2 * np.random.default_rng(0).random(mask.shape)).astype(np.float32)
+    lit = dataclasses.replace(clean, frames=[f + room for f in clean.frames], ambient=room)
+    np.testing.assert_allclose(stv.solve(lit).normal, stv.solve(clean).normal, atol=2e-3)
+
+
 def test_near_field_lights_and_flat_field_are_interpolated() -> None:
     normal, mask = sphere(40, limit=0.5)
     grid = np.broadcast_to(lights_of(4), (6, 6, 4, 3)).copy()

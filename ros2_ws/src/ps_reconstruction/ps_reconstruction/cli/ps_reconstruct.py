@@ -19,7 +19,8 @@ from ps_reconstruction import preview
 from ps_reconstruction.pipeline import METHODS, OUTPUTS, Options, Reconstruction, reconstruct
 from ps_reconstruction.session_reader import Scan, Session, is_session
 
-ARRAYS = ('normal', 'slope', 'albedo', 'height', 'curvature', 'shape', 'confidence', 'mask')
+ARRAYS = ('normal', 'slope', 'albedo', 'height', 'curvature', 'shape', 'confidence', 'reason',
+          'mask')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -59,6 +60,8 @@ def _parser() -> argparse.ArgumentParser:
                         help='slant of lights of unknown geometry (default: 45)')
     parser.add_argument('--near-field', action=argparse.BooleanOptionalAction, default=True,
                         help='light vectors per pixel (default: yes)')
+    parser.add_argument('--bits', type=int, default=0, metavar='N',
+                        help='bits that count of a pixel in 16, for 10, 12 or 14-bit cameras')
     parser.add_argument('--careful', action='store_true',
                         help='integrate with confidence weights and height steps')
     parser.add_argument('--pixel-pitch', type=float, default=0.0, metavar='M',
@@ -103,7 +106,7 @@ def _process(stack: Stack, truth: Truth | None, out: Path, options: argparse.Nam
     """Reconstruct one stack, write its files, print and return its figures."""
     result = reconstruct(stack, Options(
         method=options.method, near_field=options.near_field, careful=options.careful,
-        pixel_pitch=options.pixel_pitch), set(OUTPUTS))
+        bits=options.bits, pixel_pitch=options.pixel_pitch), set(OUTPUTS))
     start = time.perf_counter()
     write_result(result, out)
     result.timings['write'] = time.perf_counter() - start

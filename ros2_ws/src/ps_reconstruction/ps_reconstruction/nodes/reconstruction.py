@@ -19,10 +19,20 @@ from ps_reconstruction.conversions import (
     info_to_message,
     quantity_to_message,
 )
-from ps_reconstruction.pipeline import FORMS, METHODS, OUTPUTS, Options, Reconstruction
+from ps_reconstruction.pipeline import (
+    FORMS,
+    METHODS,
+    OUTPUTS,
+    TRUSTS,
+    Options,
+    Reconstruction,
+)
 
 PARAMETERS = [
     Parameter('method', 'ls', 'Solver', choices=METHODS),
+    Parameter('trust', 'auto', 'How far stv departs from least squares; auto: chosen for every '
+              'stack', choices=TRUSTS),
+    Parameter('patch', 5, 'Width of the neighbourhood of stv, odd; 1: none', 'px', 1, 15),
     Parameter('near_field', True, 'Light vectors per pixel from the panel geometry; false: '
               'distant lights'),
     Parameter('height_rounds', 2, 'Alternations of height and lighting; 0: lights on the plane',
@@ -32,6 +42,8 @@ PARAMETERS = [
     Parameter('careful', False, 'Integrate with confidence weights and height steps (slower)'),
     Parameter('form', 'auto', 'Form removed from the height; auto: slow where the lights are '
               'assumed, else none', choices=FORMS),
+    Parameter('bits', 0, 'Bits that count of a pixel in 16, for cameras with 10, 12 or 14; 0: all '
+              'of the pixel type', 'bit', 0, 16),
     Parameter('saturation', 0.98, 'Share of full scale that counts as saturated', '', 0.1, 1.0),
     Parameter('smoothness', 1.0, 'Smoothing of shape and curvature (sigma)', 'px', 0.0, 50.0),
     Parameter('flattening', 0.0, 'Length beyond which form is removed from the shape; 0: a 150th '

@@ -182,8 +182,8 @@ def reconstruct(stack: Stack, options: Options | None = None,
     return result
 
 
-def warm_up() -> None:
-    """Compile all kernels on a small stack, so that the first real one is not late."""
+def warm_up(method: str = 'ls') -> None:
+    """Compile the kernels of a method on a small stack, so that the first real one is not late."""
     from ps_head_driver.head_model import CameraGeometry
     from ps_head_driver.stack import Light, Panel
     camera = CameraGeometry(width_px=48, height_px=40, fx=300, fy=300, cx=23.5, cy=19.5,
@@ -193,7 +193,7 @@ def warm_up() -> None:
               for i, (c, s) in enumerate([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])]
     for dtype in (np.uint8, np.uint16):
         images = [np.full((40, 48), 100, dtype) for _ in lights]
-        reconstruct(Stack(images, lights, camera))
+        reconstruct(Stack(images, lights, camera), Options(method=method))
 
 
 @contextmanager

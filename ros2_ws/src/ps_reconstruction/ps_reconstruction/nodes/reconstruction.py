@@ -108,7 +108,7 @@ class ReconstructionNode(Node):
         # compiled before the first stack comes, not while it waits
         start = time.perf_counter()
         try:
-            pipeline.warm_up()
+            pipeline.warm_up(self.parameters['method'])
         except Exception as error:
             # the stacks to come will say the same in their answers
             ros_support.as_ps_error(self, error, ErrorCode.RECONSTRUCTION_INTERNAL)

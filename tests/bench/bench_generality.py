@@ -1,4 +1,6 @@
 """LS and STV on seven rendered shapes, many materials, 96, ten and four lights: never worse."""
+from dataclasses import asdict
+import json
 import os
 from pathlib import Path
 
@@ -14,7 +16,7 @@ from ps_reconstruction.problem import Problem, constant_lights
 from tests.bench.shape_renderer import MATERIALS, MIXED, Shape
 
 DATA = Path(os.environ.get('PS_DATA', Path(__file__).resolve().parents[3] / 'shared' / 'data'))
-THREE = ('matt', 'glossy', 'metal-like')      # by default; PS_BENCH_ALL=1 for all materials
+THREE = ('matt', 'glossy', 'metal-like')      # by default; PS_BENCH_ALL=1: all
 SETS = {'four': [76, 56, 28, 49], 'ten': [76, 56, 28, 49, 96, 48, 4, 41, 89, 17],
         '96': list(range(1, 97))}             # 1-based numbers of DiLiGenT's lights
 WORSE = 0.005                                 # degrees, what counts as worse
@@ -65,6 +67,7 @@ def main() -> None:
     table = Table('lights', 'material', 'shape', 'LS', 'STV', 'trust', 'confidence: rank corr.',
                   title='angular error, degrees: mean / median / p90')
     worse = total = 0
+    rows = []
     for file in files:
         if chosen and file.stem not in chosen:
             continue
@@ -73,6 +76,7 @@ def main() -> None:
             value = shape.render(material)
             for name, lights in SETS.items():
                 ls, robust, correlation, trust = compare(shape, value, lights)
+                rows.append((name, material, shape.name, asdict(ls), asdict(robust), correlation))
                 bad = robust.mean > ls.mean + WORSE or robust.p90 > ls.p90 + WORSE
                 worse, total = worse + bad, total + 1
                 if bad:
@@ -83,6 +87,8 @@ def main() -> None:
         console.print(f'{shape.name}: done, {worse} of {total} worse', style='dim')
     table.caption = f'STV worse than LS in mean or p90: {worse} of {total}'
     console.print(table)
+    if os.environ.get('PS_BENCH_JSON'):
+        Path(os.environ['PS_BENCH_JSON']).write_text(json.dumps(rows), encoding='utf-8')
 
 
 if __name__ == '__main__':

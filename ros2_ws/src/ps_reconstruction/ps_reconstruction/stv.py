@@ -43,6 +43,8 @@ SAMPLE_FRAMES = 64000         # pixels times lights of the plan
 SAMPLE_BAND = 512             # samples per core and call
 ROUNDS = 5                    # of the reflectance fit
 NOT_LAMBERTIAN = 0.04         # median misfit of LS from which few lights tell nothing more
+NOT_EXPLAINED = 0.05          # upper quartile of the misfit after rejection: likewise
+DOUBTFUL = (0.1, 0.15)        # median misfit of many lights: LS begins to count, counts fully
 QUANTILE = 0.75               # of the misfits, by which the estimates are compared
 
 
@@ -91,11 +93,14 @@ class Plan:
     """What holds for the whole stack: the reflectance and how far to trust it.
 
     :param scatter: expected relative error of a pixel's own scaled normal.
+    :param hold: share of the LS normal added to the robust unit normal, 1 where many frames are
+        explained badly: then neither is right and their errors partly cancel.
     """
 
     coefficients: NDArray[np.float64]
     trust: Trust
     scatter: float = 0.0
+    hold: float = 0.0
 
 
 def solve(problem: Problem, options: StvOptions | None = None, quality: bool = True,
@@ -150,7 +155,7 @@ def solve(problem: Problem, options: StvOptions | None = None, quality: bool = T
         confidence = np.empty((last - first, width), np.uint8)
         sums: tuple[float, float, int] = finish_band(
             solved, reference[:, inner], tally[:, inner], mask[inner], problem.count,
-            result.normal[first:last], length, confidence, reason[inner])
+            decided.hold, result.normal[first:last], length, confidence, reason[inner])
         if problem.colour:
             colour = np.einsum('thw,thwc->hwc', shading[:, inner], channels[:, inner])
             colour[np.isnan(length)] = np.nan
@@ -174,7 +179,9 @@ def plan(problem: Problem, options: StvOptions | None = None) -> Plan:
     """Fit the object's reflectance to sample pixels and choose how far to trust it.
 
     The choice compares how well each estimate predicts all frames of the samples, the rejected
-    ones included: |difference| / mean intensity of the pixel, its upper quartile.
+    ones included: |difference| / mean intensity of the pixel, its upper quartile. Few lights must
+    also be explained well by a matt body and a few outliers; where many lights are not, part of
+    the LS normal is added (`Plan.hold`).
     """
     options = options or StvOptions()
     u, d, h, usable, g_ls = _samples(problem)
@@ -202,21 +209,27 @@ def plan(problem: Problem, options: StvOptions | None = None) -> Plan:
         information, right = (sum(part[i] for part in parts) for i in (0, 1))
         coefficients = reflectance.improved(coefficients, information, right)
         g = estimated(coefficients, Trust.REFLECTANCE)
-    misfit_ls = _misfit(u, d, h, g_ls, lambertian)
-    level = {
-        Trust.LEAST_SQUARES: np.quantile(misfit_ls, QUANTILE),
-        Trust.REJECTION: np.quantile(_misfit(u, d, h, g_first, lambertian), QUANTILE),
-        Trust.REFLECTANCE: np.quantile(_misfit(u, d, h, g, coefficients), QUANTILE)}
-    if problem.count >= MANY:      # the first estimate has never been worse than LS here
+    misfit = {
+        Trust.LEAST_SQUARES: _misfit(u, d, h, g_ls, lambertian),
+        Trust.REJECTION: _misfit(u, d, h, g_first, lambertian),
+        Trust.REFLECTANCE: _misfit(u, d, h, g, coefficients)}
+    level = {trust: float(np.quantile(values, QUANTILE)) for trust, values in misfit.items()}
+    middle = {trust: float(np.median(values)) for trust, values in misfit.items()}
+    if options.trust is not None:
+        trust = options.trust
+    elif problem.count >= MANY:
         fits = level[Trust.REFLECTANCE] <= level[Trust.REJECTION]
         trust = Trust.REFLECTANCE if fits else Trust.REJECTION
-    elif np.median(misfit_ls) > NOT_LAMBERTIAN:
+    elif (middle[Trust.LEAST_SQUARES] > NOT_LAMBERTIAN
+          or level[Trust.REJECTION] > NOT_EXPLAINED):
         trust = Trust.LEAST_SQUARES
     else:      # dropping frames always lowers the misfit of few; that alone must not count
         trust = max(choice for choice in Trust if level[choice] <= level[Trust.LEAST_SQUARES])
-    if options.trust is not None:
-        trust = options.trust
-    return Plan(coefficients, trust, max(float(level[trust] * (4 / problem.count) ** 0.5), 1e-4))
+    hold = 0.0
+    if problem.count >= MANY:
+        low, high = DOUBTFUL
+        hold = float(np.clip((middle[trust] - low) / (high - low), 0, 1))
+    return Plan(coefficients, trust, max(level[trust] * (4 / problem.count) ** 0.5, 1e-4), hold)
 
 
 def _misfit(u: NDArray, d: NDArray, h: NDArray, g: NDArray, coefficients: NDArray) -> NDArray:

@@ -311,12 +311,13 @@ def add_neighbours(row, spatial, near, pixels, system):    # type: ignore[no-unt
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def finish(solved, reference, quality, mask, count, normal, albedo, confidence, reason):    # type: ignore[no-untyped-def]
+def finish(solved, reference, quality, mask, count, hold, normal, albedo, confidence, reason):    # type: ignore[no-untyped-def]
     """Unit normal, albedo and confidence of a band (paper, Eq. 7); returns the residual sums.
 
     The confidence falls with the expected error: the misfit of the frames, more where few of them
     are left and where the surface is seen at a grazing angle, and the distance to least squares.
 
+    :param hold: share of the LS normal added to the robust unit normal.
     :param albedo: (h, W) out.
     :param confidence: (h, W) uint8 out.
     """
@@ -336,19 +337,21 @@ def finish(solved, reference, quality, mask, count, normal, albedo, confidence, 
                     reason[y, x] |= np.uint8(FEW_LIGHTS)
                 continue
             length = np.sqrt(g0 * g0 + g1 * g1 + g2 * g2)
+            r0, r1, r2 = reference[0, y, x], reference[1, y, x], reference[2, y, x]
+            other = one / max(np.sqrt(r0 * r0 + r1 * r1 + r2 * r2), np.float32(1e-30))
             inverse = one / length
-            normal[y, x, 0] = g0 * inverse
-            normal[y, x, 1] = g1 * inverse
-            normal[y, x, 2] = g2 * inverse
+            d0, d1, d2 = (g0 * inverse - r0 * other, g1 * inverse - r1 * other,
+                          g2 * inverse - r2 * other)
+            share = np.float32(hold) * other
+            n0, n1, n2 = (g0 * inverse + share * r0, g1 * inverse + share * r1,
+                          g2 * inverse + share * r2)
+            scale = one / np.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+            normal[y, x, 0], normal[y, x, 1], normal[y, x, 2] = n0 * scale, n1 * scale, n2 * scale
             albedo[y, x] = length
             squares += quality[0, y, x]
             brightness += quality[1, y, x]
             valid += 1
             used = max(quality[2, y, x], one)
-            r0, r1, r2 = reference[0, y, x], reference[1, y, x], reference[2, y, x]
-            other = one / max(np.sqrt(r0 * r0 + r1 * r1 + r2 * r2), np.float32(1e-30))
-            d0, d1, d2 = (g0 * inverse - r0 * other, g1 * inverse - r1 * other,
-                          g2 * inverse - r2 * other)
             error = ((np.float32(NOISE) + quality[3, y, x]) * np.sqrt(np.float32(count) / used)
                      / max(g2 * inverse, np.float32(0.1))
                      + np.float32(DISAGREEMENT) * np.sqrt(d0 * d0 + d1 * d1 + d2 * d2))

@@ -63,7 +63,10 @@ def solve(problem: Problem, options: StvOptions | None = None,
     for y, x in np.argwhere(np.isfinite(own[..., 0])):
         result[y, x] = _patch(y, x, own, kept, reference[y, x], intensity, effective,
                               irradiance, decided, options)
-    return result
+    length = np.linalg.norm(result, axis=-1, keepdims=True)
+    mean = result / length + decided.hold * reference / np.linalg.norm(
+        reference, axis=-1, keepdims=True)
+    return mean * length / np.linalg.norm(mean, axis=-1, keepdims=True)
 
 
 def pixel(u: NDArray, d: NDArray, h: NDArray, usable: NDArray, g: NDArray, decided: Plan,

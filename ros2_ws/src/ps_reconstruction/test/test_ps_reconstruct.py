@@ -36,7 +36,8 @@ def test_files_and_figures(folder: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert content['timings_s']['normals'] > 0
     result = np.load(out / 'result.npz')
     assert set(result.files) == {
-        'normal', 'slope', 'albedo', 'height', 'shape', 'confidence', 'reason', 'mask'}
+        'normal', 'slope', 'albedo', 'height', 'curvature', 'shape', 'confidence', 'reason',
+        'mask'}
     assert result['slope'].reshape(-1, 2).mean(axis=0) == pytest.approx((0.1, -0.05), abs=2e-3)
     assert result['normal'][..., 2].min() > 0
     for name, kind in {'normal': np.uint16, 'slope': np.uint16, 'albedo': np.uint16,

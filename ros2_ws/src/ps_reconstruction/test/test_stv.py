@@ -220,6 +220,29 @@ def test_metal_like_surfaces_with_few_lights_keep_least_squares() -> None:
                                atol=1e-3)
 
 
+@pytest.mark.parametrize('count', [4, 6, 10, 32])
+@pytest.mark.parametrize(('albedo', 'gloss'), [(0.5, 0.0), (0.03, 0.3), (0.0, 1.0)])
+def test_never_worse_than_least_squares(count: int, albedo: float, gloss: float) -> None:
+    """Matt, black gloss, bare metal: neither the mean nor the tail of the error may grow."""
+    normal, mask = sphere(64, limit=0.9)
+    problem = render(normal, mask, lights_of(count), gloss=gloss, noise=0.002, albedo=albedo)
+    robust, plain = (np.nan_to_num(errors(solver(problem).normal, normal, mask), nan=90.0)
+                     for solver in (stv.solve, least_squares.solve))
+    assert robust.mean() < plain.mean() + 0.05
+    assert np.percentile(robust, 90) < np.percentile(plain, 90) + 0.05
+
+
+def test_badly_explained_frames_pull_towards_least_squares() -> None:
+    normal, mask = sphere(48)
+    problem = render(normal, mask, lights_of(12), gloss=0.4)
+    free, held = (stv.solve(problem, decided=Plan(np.zeros(reflectance.TERMS), Trust.REJECTION,
+                                                  0.01, hold)).normal[mask] for hold in (0.0, 1.0))
+    plain = least_squares.solve(problem).normal[mask]
+    middle = free + plain
+    middle /= np.linalg.norm(middle, axis=-1, keepdims=True)
+    np.testing.assert_allclose(held, middle, atol=1e-3)
+
+
 def test_the_confidence_predicts_the_error() -> None:
     normal, mask = sphere(96, limit=0.9)
     problem = render(normal, mask, lights_of(4), gloss=0.4, noise=0.003)

@@ -40,11 +40,11 @@ SMALLEST_VALID_FRACTION = 0.9
 
 
 CAPTIONS = {
-    'shape': 'Shape-enhanced image: raised bright, sunk dark.',
-    'normal': 'Normals: red to the right, green up, blue to the viewer.',
-    'slope': 'Slopes: hue is the direction, strength the steepness.',
-    'albedo': 'Albedo: what remains when the light is taken out.',
-    'confidence': 'Confidence: white where all lights agree.',
+    'shape': 'Raised bright, sunk dark.',
+    'normal': 'Red to the right, green up, blue to the viewer.',
+    'slope': 'Hue is the direction, strength the steepness.',
+    'albedo': 'What remains when the light is taken out.',
+    'confidence': 'White where all lights agree.',
     'normal_error': 'Angle to the true normal, from black at 0 to white at 5 degrees.',
 }
 
@@ -144,7 +144,7 @@ def _inspect(
     with step('start recording'):
         session = client.call(srv.StartSession, 'session/start', srv.StartSession.Request(
             name='demo', part_id='demo-part', notes='written by the demo'))
-    with step('capture'):
+    with step('capture' if options.input_folder else 'capture, rendering of the scene included'):
         begin = time.monotonic()
         stack_id = client.capture(part_id='demo-part')
         stack = client.stack(stack_id)

@@ -1,5 +1,6 @@
 """The whole chain as real processes over DDS: capture to published slope, refusals, restarts."""
 from collections.abc import Callable, Iterator
+import importlib
 from pathlib import Path
 import threading
 import time
@@ -9,7 +10,9 @@ import pytest
 
 pytest.importorskip('ps_interfaces.msg', reason='needs the built workspace (make setup)')
 
-from rcl_interfaces.srv import SetParameters
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import Parameter as RosParameter
+from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
 
@@ -21,6 +24,7 @@ from ps_head_driver.frames import optical_to_plane
 from ps_head_driver.head_model import load_head, nominal_head_path
 from ps_head_driver.stack import Panel, angular_error_deg
 from ps_inspection.cell_client import CellClient
+from ps_inspection.graph import NODES
 from ps_inspection.runner import Cell
 from ps_interfaces import action, srv
 from ps_interfaces import msg as ps
@@ -263,6 +267,39 @@ def test_parameter_change_works_or_says_why(client: CellClient, node, name, valu
     client.node.destroy_client(service)
     assert result.successful == accepted, result.reason
     assert accepted or len(result.reason) > 10
+
+
+@pytest.mark.parametrize('node', [node.executable for node in NODES])
+def test_every_parameter_changes_at_run_time_or_says_why_not(client: CellClient, node: str):
+    own = importlib.import_module(
+        f'{next(n.package for n in NODES if n.executable == node)}.nodes.{node}').PARAMETERS
+    getting = client.node.create_client(GetParameters, f'{node}/get_parameters')
+    setting = client.node.create_client(SetParameters, f'{node}/set_parameters')
+    values = ros_support.call(
+        getting, GetParameters.Request(names=[p.name for p in own]), 10.0,
+        ErrorCode.SEQUENCER_INTERNAL).values
+    requests = [RosParameter(name=p.name, value=value)
+                for p, value in zip(own, values, strict=True)]
+    results = ros_support.call(setting, SetParameters.Request(parameters=requests), 10.0,
+                               ErrorCode.SEQUENCER_INTERNAL).results
+    for parameter, result in zip(own, results, strict=True):
+        assert result.successful != parameter.read_only, (parameter.name, result.reason)
+        assert result.successful or len(result.reason) > 10
+    client.node.destroy_client(getting)
+    client.node.destroy_client(setting)
+
+
+def test_every_node_reports_to_diagnostics(client: CellClient):
+    names: set[str] = set()
+    subscription = client.node.create_subscription(
+        DiagnosticArray, '/diagnostics',
+        lambda array: names.update(status.name.split(':')[0] for status in array.status), 10)
+    wanted = {f'ps_head/{node.executable}' for node in NODES}
+    deadline = time.monotonic() + 10
+    while not wanted <= names and time.monotonic() < deadline:
+        time.sleep(0.05)
+    client.node.destroy_subscription(subscription)
+    assert wanted <= names
 
 
 def test_killed_reconstruction_comes_back_after_a_restart(cell: Cell, client: CellClient):

@@ -27,13 +27,17 @@ def _fit_all(points):  # type: ignore[no-untyped-def]
     fits = np.empty((len(points), 4))
     x, y = np.empty(points.shape[1]), np.empty(points.shape[1])
     for i in range(len(points)):
-        fits[i, 0], fits[i, 1], fits[i, 2], fits[i, 3] = _fit(points[i], x, y)
+        fits[i, 0], fits[i, 1], fits[i, 2], fits[i, 3] = fit_circle(points[i], x, y)
     return fits
 
 
 @nb.njit(cache=True)
-def _fit(points, x, y):  # type: ignore[no-untyped-def]
-    """One circle; x and y are scratch arrays, as long as there are points."""
+def fit_circle(points, x, y):  # type: ignore[no-untyped-def]
+    """Centre x and y, radius and rms distance of one circle, for compiled code.
+
+    :param points: (k, 2).
+    :param x, y: scratch arrays (k,).
+    """
     count = len(points)
     x0 = y0 = spread = 0.0
     for i in range(count):

@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from ps_head_driver.circle_fit import fit_circles
+from ps_head_driver.circle_fit import fit_circle, fit_circles
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import DIRECTIONS, HeadModel
 from ps_head_driver.kinematics import BrightFieldKinematics
@@ -33,6 +34,10 @@ class Branch(IntEnum):
     UNCROSSED = 1
     CROSSED = 2
     MIXED = 3
+
+
+# compiled code knows plain numbers only
+_UNCROSSED, _CROSSED, _MIXED = int(Branch.UNCROSSED), int(Branch.CROSSED), int(Branch.MIXED)
 
 
 @dataclass(frozen=True)
@@ -78,6 +83,52 @@ def inverse(head: HeadModel, convergence_radius: float, light_height: float | No
     return CrSolver(head, light_height).inverse(convergence_radius, branch)
 
 
+@nb.njit(cache=True)
+def _intersections(center, axis, radial, plane_z):  # type: ignore[no-untyped-def]
+    """Points (n, 4, 2) in which axes meet the plane, and their radial components (n, 4)."""
+    points, distance = np.empty((len(center), 4, 2)), np.empty((len(center), 4))
+    for i in range(len(center)):
+        for k in range(4):
+            along = np.nan
+            if axis[i, k, 2] < -_FLATTEST_AXIS and center[i, k, 2] > plane_z:
+                along = (plane_z - center[i, k, 2]) / axis[i, k, 2]
+            distance[i, k] = 0.0
+            for c in range(2):
+                points[i, k, c] = center[i, k, c] + along * axis[i, k, c]
+                distance[i, k] += points[i, k, c] * radial[k, c]
+    return points, distance
+
+
+@nb.njit(cache=True)
+def _branches(radial):  # type: ignore[no-untyped-def]
+    """Branch of each row; 0 where an axis does not meet the plane."""
+    branch = np.empty(len(radial), np.int64)
+    for i in range(len(radial)):
+        outward = inward = 0
+        missing = False
+        for k in range(4):
+            missing |= np.isnan(radial[i, k])
+            outward += radial[i, k] >= 0
+            inward += radial[i, k] <= 0
+        branch[i] = 0 if missing else (
+            _UNCROSSED if outward == 4 else (_CROSSED if inward == 4 else _MIXED))
+    return branch
+
+
+@nb.njit(cache=True)
+def _circles(points, radial):  # type: ignore[no-untyped-def]
+    """CR, branch, and rms distance from the circle over its radius, each (n,)."""
+    branch = _branches(radial)
+    cr, poorness = np.full(len(points), np.nan), np.full(len(points), np.nan)
+    x, y = np.empty(4), np.empty(4)
+    for i in range(len(points)):
+        if branch[i] > 0:
+            _, _, radius, residual = fit_circle(points[i], x, y)
+            cr[i] = 2 * radius
+            poorness[i] = residual / max(radius, 1e-12)
+    return cr, branch, poorness
+
+
 class CrSolver:
     """Forward and inverse for one head and one plane."""
 
@@ -87,6 +138,7 @@ class CrSolver:
                           f'light_height: {light_height} is not a positive length in metres')
         self._motor = BrightFieldKinematics(head)
         at_home = self._axes(np.array([float(head.bright_field.slider.m0_counts)]))[0]
+        self._reachable: dict[Branch, tuple[float, float]] = {}
         # the paper's h is C_z at m_0: it says where the plane is, and the plane stays there
         self.plane_z = float(at_home[0, :, 2].mean()) - light_height if light_height else 0.0
 
@@ -103,38 +155,13 @@ class CrSolver:
         :returns: points (n, 4, 2), NaN where an axis does not meet the plane in front of its
             panel, and radial components (n, 4), m.
         """
-        center, axis = self._axes(m)
-        falls = axis[..., 2] < -_FLATTEST_AXIS
-        above = center[..., 2] > self.plane_z
-        along = np.divide(self.plane_z - center[..., 2], axis[..., 2],
-                          out=np.full(falls.shape, np.nan), where=falls & above)
-        points = center[..., :2] + along[..., None] * axis[..., :2]
-        return points, (points * self._motor.ring.radial[:, :2]).sum(axis=-1)
+        return _intersections(*self._axes(m), self._motor.ring.radial, self.plane_z)
 
-    @staticmethod
-    def _branches(radial: NDArray) -> NDArray:
-        """Branch of each row; 0 where an axis does not meet the plane."""
-        branch = np.full(len(radial), Branch.MIXED, np.int64)
-        branch[np.all(radial >= 0, axis=1)] = Branch.UNCROSSED
-        branch[np.all(radial <= 0, axis=1)] = Branch.CROSSED
-        branch[np.isnan(radial).any(axis=1)] = 0
-        return branch
-
-    def evaluate(self, m: NDArray) -> tuple[NDArray, NDArray]:
-        """CR (NaN without intersection) and branch at motor positions."""
-        cr, branch, _ = self._circles(*self.intersections(m))
-        return cr, branch
-
-    def _circles(self, points: NDArray, radial: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """CR, branch, and rms distance from the circle over its radius."""
-        branch = self._branches(radial)
-        cr, poorness = np.full((2, len(points)), np.nan)
-        good = branch > 0
-        if good.any():
-            _, radius, residual = fit_circles(points[good])
-            cr[good] = 2 * radius
-            poorness[good] = residual / np.maximum(radius, 1e-12)
-        return cr, branch, poorness
+    def evaluate(self, m: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """At motor positions (n,): CR (NaN without intersection), branch, and how badly the points
+        lie on the circle (rms distance over its radius).
+        """
+        return _circles(*self.intersections(m))
 
     # ------------------------------------------------------------------ forward
 
@@ -157,7 +184,7 @@ class CrSolver:
                           f'the axis of panel {", ".join(missing)} does not meet the plane '
                           f'at m = {m_counts} (tilt {np.degrees(self._motor.tilt(m_counts)):.2f} '
                           'deg)')
-        branches = self._branches(radial)
+        branches = _branches(radial)
         center, radius, residual = fit_circles(points[branches == branches[here]])
         # Of the changes to both neighbours on the branch the smaller one: four points of a very
         # asymmetric head may have two circles that fit equally well, and CR jumps between them.
@@ -178,20 +205,20 @@ class CrSolver:
         """Motor positions (ascending whole counts), CR and branch there, branch ends included."""
         low, high = self._motor.limits_counts
         m = np.unique(np.linspace(low, high, _SAMPLES).round())
-        samples = [(m, *self.intersections(m))]
-        branch = self._branches(samples[0][2])
+        samples = [(m, *self.evaluate(m))]
+        branch = samples[0][2]
         changes = branch[:-1] != branch[1:]
         below, above, side = m[:-1][changes], m[1:][changes], branch[:-1][changes]
         while len(below) and np.any(above - below > 1):      # narrow down every change of branch
             tries = np.linspace(below, above, _TRIES, axis=1).round()
-            samples.append((tries.ravel(), *self.intersections(tries.ravel())))
-            there = self._branches(samples[-1][2]).reshape(tries.shape)
+            samples.append((tries.ravel(), *self.evaluate(tries.ravel())))
+            there = samples[-1][2].reshape(tries.shape)
             last = np.argmax(there != side[:, None], axis=1) - 1
             rows = np.arange(len(below))
             below, above = tries[rows, last], tries[rows, last + 1]
-        m, points, radial = (np.concatenate(parts) for parts in zip(*samples, strict=True))
+        m, *found = (np.concatenate(parts) for parts in zip(*samples, strict=True))
         m, first = np.unique(m, return_index=True)
-        return self._with_jumps(m, *self._circles(points[first], radial[first]))
+        return self._with_jumps(m, *(values[first] for values in found))
 
     def _with_jumps(self, m: NDArray, cr: NDArray, branch: NDArray, poorness: NDArray,
                     ) -> tuple[NDArray, NDArray, NDArray]:
@@ -214,7 +241,7 @@ class CrSolver:
             if not jumps.any():
                 return m, cr, branch
             between = np.linspace(m[1:-2][jumps], m[2:-1][jumps], 10).round().ravel()
-            added = self._circles(*self.intersections(between))
+            added = self.evaluate(between)
             m, first = np.unique(np.concatenate([m, between]), return_index=True)
             cr, branch, poorness = (np.concatenate([old, new])[first] for old, new in zip(
                 (cr, branch, poorness), added, strict=True))
@@ -228,10 +255,12 @@ class CrSolver:
             exists = [b for b in (Branch.UNCROSSED, Branch.CROSSED, Branch.MIXED)
                       if (self.sampled[2] == b).any()]
             return self.reachable(exists[0]) if exists else (float('nan'), float('nan'))
-        if not (self.sampled[2] == branch).any():
-            return float('nan'), float('nan')
-        lowest, highest = self._nearest(branch, [0.0, np.inf])[1]      # CR is never negative
-        return lowest, highest
+        if branch not in self._reachable:
+            self._reachable[branch] = (float('nan'), float('nan'))
+            if (self.sampled[2] == branch).any():
+                lowest, highest = self._nearest(branch, [0.0, np.inf])[1]   # CR is never negative
+                self._reachable[branch] = lowest, highest
+        return self._reachable[branch]
 
     def _nearest(self, branch: Branch, goals: list[float]) -> tuple[list[int], list[float]]:
         """Motor counts of a branch that exists, and CR there, nearest to each wanted CR.
@@ -258,7 +287,8 @@ class CrSolver:
         rows = np.arange(len(index))
         while True:
             tries = np.linspace(low, high, _TRIES, axis=1).round()
-            cr, branches = (found.reshape(tries.shape) for found in self.evaluate(tries.ravel()))
+            cr, branches, _ = (
+                found.reshape(tries.shape) for found in self.evaluate(tries.ravel()))
             there = distance(cr, branches, wanted[owner, None])
             at = np.argmin(there, axis=1)
             if np.all(high - low < _TRIES):
@@ -281,12 +311,16 @@ class CrSolver:
         for candidate in tried:
             if not (self.sampled[2] == candidate).any():
                 continue
-            counts, (lowest, highest, _) = self._nearest(candidate, [0.0, np.inf, wanted])
-            intervals[candidate] = (lowest, highest)
-            solution = self._at(counts[-1])
+            # the ends of the interval are kept; the first time all are searched together
+            goals = [wanted] if candidate in self._reachable else [wanted, 0.0, np.inf]
+            counts, found = self._nearest(candidate, goals)
+            if len(goals) > 1:
+                self._reachable[candidate] = found[1], found[2]
+            intervals[candidate] = self._reachable[candidate]
+            solution = self._at(counts[0])
             # farther off than one count moves it lies beyond an end or in a gap of the branch
             if abs(solution.convergence_radius - wanted) <= abs(solution.dcr_dm) + 1e-9:
-                return replace(solution, reachable=(lowest, highest))
+                return replace(solution, reachable=intervals[candidate])
         where = '; '.join(f'{name.name.lower()} {lowest * 1e3:.2f} to {highest * 1e3:.2f} mm'
                           for name, (lowest, highest) in intervals.items())
         raise PsError(ErrorCode.CR_UNREACHABLE,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import math
 from typing import Any
 
+import numba as nb
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -62,11 +63,10 @@ class PanelRing:
         :param tilt: (...), rad; axis = -sin(tilt) radial - cos(tilt) z.
         :returns: (..., 4, 3) and (..., 4, 3).
         """
-        angle = (np.asarray(tilt, np.float64)[..., None] + self._tilt_offset)[..., None]
-        sine, cosine = np.sin(angle), np.cos(angle)
-        axis = -sine * self._outward - cosine * _VERTICAL
-        arm = self._along * (cosine * self._outward - sine * _VERTICAL) + self._out * axis
-        return self.hinges + arm, axis
+        tilt = np.asarray(tilt, np.float64)
+        center, axis = _axes(np.atleast_1d(tilt).ravel(), self._tilt_offset, self.hinges,
+                             self._outward, self._along, self._out)
+        return center.reshape(*tilt.shape, 4, 3), axis.reshape(*tilt.shape, 4, 3)
 
     def pose(self, direction: Direction, tilt: float) -> PanelPose:
         """Pose of one panel at a nominal tilt, rad."""
@@ -75,6 +75,21 @@ class PanelRing:
         return PanelPose(center=center[index], axis=axis[index], right=self.right[index],
                          size=self.size, lobe_exponent=self.lobe_exponent,
                          intensity=self.intensities[index])
+
+
+@nb.njit(cache=True)
+def _axes(tilt, offset, hinge, outward, along, out):  # type: ignore[no-untyped-def]
+    """Centres and axes (n, 4, 3) at tilts (n,); the panels' own data as in PanelRing."""
+    center, axis = np.empty((len(tilt), 4, 3)), np.empty((len(tilt), 4, 3))
+    for i in range(len(tilt)):
+        for k in range(4):
+            sine, cosine = math.sin(tilt[i] + offset[k]), math.cos(tilt[i] + offset[k])
+            for c in range(3):
+                vertical = 1.0 if c == 2 else 0.0
+                axis[i, k, c] = -sine * outward[k, c] - cosine * vertical
+                center[i, k, c] = (hinge[k, c] + out * axis[i, k, c]
+                                   + along * (cosine * outward[k, c] - sine * vertical))
+    return center, axis
 
 
 def _turned(azimuth: NDArray) -> tuple[NDArray, NDArray]:

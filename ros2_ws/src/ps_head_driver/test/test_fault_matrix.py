@@ -119,6 +119,34 @@ def test_fault(cell: Cell, cause: str, activity: str) -> None:
     assert code is None
 
 
+@pytest.mark.parametrize('activity', ['idle', 'homing', 'moving', 'strobing'])
+def test_stop_from_any_state_leaves_panels_off_and_the_motor_still(
+        cell: Cell, activity: str) -> None:
+    supervisor, control = cell
+    recover(supervisor)
+    thread = threading.Thread(target=lambda: operate(supervisor, activity))
+    if activity == 'homing':
+        thread = threading.Thread(target=lambda: suppressed(supervisor.home))
+    thread.start()
+    wanted = {'idle': 'IDLE'}.get(activity, activity.upper())
+    deadline = time.monotonic() + 2.0
+    while control.command('state')['activity'] != wanted and time.monotonic() < deadline:
+        time.sleep(0.002)
+    supervisor.stop()
+    assert not control.command('state')['panels_on']
+    thread.join()
+    state = control.command('state')
+    assert (state['activity'], state['panels_on']) == ('IDLE', False)
+    if activity == 'homing':
+        assert not state['homed']
+    assert recover(supervisor) < RECOVERY_S
+
+
+def suppressed(home: Any) -> None:
+    with suppress(PsError):
+        home(5.0)
+
+
 def test_limit_switch(cell: Cell) -> None:
     supervisor, _ = cell
     recover(supervisor)

@@ -17,7 +17,12 @@ pytest.importorskip('ps_interfaces.msg', reason='needs the built workspace (make
 from sensor_msgs.msg import Image
 
 from ps_head_driver.cameras import aravis
-from ps_head_driver.conversions import image_to_message, message_to_image, time_to_message
+from ps_head_driver.conversions import (
+    ENCODINGS,
+    image_to_message,
+    message_to_image,
+    time_to_message,
+)
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.fake.trigger_socket import TriggerListener, default_path
 from ps_head_driver.stack import Geometry, Panel
@@ -75,6 +80,8 @@ class TopicDriver:
 
     def __init__(self, client: CellClient) -> None:
         self.lose = 0
+        self.encoding = 'bgr8'
+        self._node = client.node
         self._publisher = client.node.create_publisher(Image, 'camera/image_raw', 8)
         self._listener = TriggerListener(default_path('ps_head'))
         self._stop = threading.Event()
@@ -89,8 +96,10 @@ class TopicDriver:
             if self.lose:
                 self.lose -= 1
                 continue
-            image = np.full((24, 32, 3), 10 + np.argmax(event.bf_levels), np.uint8)
-            message = image_to_message(image, encoding='bgr8')
+            dtype, channels = ENCODINGS[self.encoding]
+            image = np.full((24, 32, channels), 10 + np.argmax(event.bf_levels), dtype)
+            message = image_to_message(image[..., 0] if channels == 1 else image,
+                                       encoding=self.encoding)
             message.header.stamp = time_to_message(10**18 + event.device_time_ns)
             self._publisher.publish(message)
 
@@ -98,6 +107,7 @@ class TopicDriver:
         self._stop.set()
         self._thread.join()
         self._listener.close()
+        self._node.destroy_publisher(self._publisher)
 
 
 @pytest.fixture(scope='module')
@@ -129,6 +139,25 @@ def test_topic_camera_matches_frames_by_their_stamps(topic_cell: CellClient):
             topic_cell.capture()
         assert error.value.code == ErrorCode.SEQUENCER_FRAME_MISSING
         assert topic_cell.capture() in topic_cell.done
+    finally:
+        driver.close()
+
+
+def test_topic_camera_lost_and_found_with_pictures_of_every_kind(topic_cell: CellClient):
+    with pytest.raises(PsError) as error:      # the driver of the test before has gone
+        topic_cell.capture()
+    assert error.value.code == ErrorCode.SEQUENCER_CAMERA_LOST
+    driver = TopicDriver(topic_cell)
+    try:
+        capture_when_found(topic_cell)
+        for encoding, published in (('mono8', 'mono8'), ('mono16', 'mono16'), ('rgb8', 'rgb8'),
+                                    ('rgb16', 'rgb16'), ('bayer_rggb8', 'rgb8'),
+                                    ('bayer_gbrg16', 'rgb16')):
+            driver.encoding = encoding
+            message = topic_cell.stack(topic_cell.capture())
+            assert [image.encoding for image in message.images] == [published] * 4
+            for i, image in enumerate(message.images):
+                np.testing.assert_array_equal(message_to_image(image), 10 + i)
     finally:
         driver.close()
 

@@ -157,10 +157,13 @@ class CrSolver:
         """
         return _intersections(*self._axes(m), self._motor.ring.radial, self.plane_z)
 
-    def evaluate(self, m: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """At motor positions (n,): CR (NaN without intersection), branch, and how badly the points
-        lie on the circle (rms distance over its radius).
-        """
+    def evaluate(self, m: NDArray) -> tuple[NDArray, NDArray]:
+        """CR (NaN without intersection) and branch at motor positions."""
+        cr, branch, _ = self._evaluate(m)
+        return cr, branch
+
+    def _evaluate(self, m: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """CR, branch, and how badly the points lie on a circle: rms distance over its radius."""
         return _circles(*self.intersections(m))
 
     # ------------------------------------------------------------------ forward
@@ -205,13 +208,13 @@ class CrSolver:
         """Motor positions (ascending whole counts), CR and branch there, branch ends included."""
         low, high = self._motor.limits_counts
         m = np.unique(np.linspace(low, high, _SAMPLES).round())
-        samples = [(m, *self.evaluate(m))]
+        samples = [(m, *self._evaluate(m))]
         branch = samples[0][2]
         changes = branch[:-1] != branch[1:]
         below, above, side = m[:-1][changes], m[1:][changes], branch[:-1][changes]
         while len(below) and np.any(above - below > 1):      # narrow down every change of branch
             tries = np.linspace(below, above, _TRIES, axis=1).round()
-            samples.append((tries.ravel(), *self.evaluate(tries.ravel())))
+            samples.append((tries.ravel(), *self._evaluate(tries.ravel())))
             there = samples[-1][2].reshape(tries.shape)
             last = np.argmax(there != side[:, None], axis=1) - 1
             rows = np.arange(len(below))
@@ -241,7 +244,7 @@ class CrSolver:
             if not jumps.any():
                 return m, cr, branch
             between = np.linspace(m[1:-2][jumps], m[2:-1][jumps], 10).round().ravel()
-            added = self.evaluate(between)
+            added = self._evaluate(between)
             m, first = np.unique(np.concatenate([m, between]), return_index=True)
             cr, branch, poorness = (np.concatenate([old, new])[first] for old, new in zip(
                 (cr, branch, poorness), added, strict=True))
@@ -288,7 +291,7 @@ class CrSolver:
         while True:
             tries = np.linspace(low, high, _TRIES, axis=1).round()
             cr, branches, _ = (
-                found.reshape(tries.shape) for found in self.evaluate(tries.ravel()))
+                found.reshape(tries.shape) for found in self._evaluate(tries.ravel()))
             there = distance(cr, branches, wanted[owner, None])
             at = np.argmin(there, axis=1)
             if np.all(high - low < _TRIES):

@@ -92,6 +92,18 @@ def _axes(tilt, offset, hinge, outward, along, out):  # type: ignore[no-untyped-
     return center, axis
 
 
+@nb.njit(cache=True)
+def _crank_angles(dz, dx, radius, rod, branch):  # type: ignore[no-untyped-def]
+    """Crank angles (n,) with the slider joint (dx, dz) from the hinge; NaN out of reach."""
+    angle = np.empty(len(dz))
+    for i in range(len(dz)):
+        distance = math.hypot(dx, dz[i])
+        cosine = (radius**2 + distance**2 - rod**2) / (2 * radius * distance)
+        angle[i] = np.nan if abs(cosine) > 1 else (
+            branch * math.acos(cosine) - math.atan2(dz[i], dx))
+    return angle
+
+
 def _turned(azimuth: NDArray) -> tuple[NDArray, NDArray]:
     """Radial and tangential unit vectors (n, 3) at azimuths (n,)."""
     c, s, zero = np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)
@@ -138,12 +150,11 @@ class BrightFieldKinematics:
     def _crank_angle(self, slider_z: ArrayLike, branch: int) -> Any:
         """Angle a of the pin, pin = hinge + radius (cos a, -sin a), on one assembly branch."""
         dz = np.asarray(slider_z, np.float64) - self._hinge[1]
-        distance = np.hypot(self._dx, dz)
-        cosine = (self._radius**2 + distance**2 - self._rod**2) / (2 * self._radius * distance)
-        if np.any(np.abs(cosine) > 1):
+        angle = _crank_angles(np.atleast_1d(dz).ravel(), self._dx, self._radius, self._rod, branch)
+        if np.isnan(angle).any():
             raise PsError(ErrorCode.CR_OUT_OF_LIMITS,
                           'the rod does not reach from the slider to the crank there')
-        return branch * np.arccos(cosine) - np.arctan2(dz, self._dx)
+        return angle.reshape(dz.shape)[()]
 
     def _usable_interval(self) -> tuple[int, int]:
         """Soft limits, cut off before the next dead points on either side of ``m0_counts``."""

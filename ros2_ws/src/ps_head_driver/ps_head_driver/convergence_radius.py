@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ps_head_driver.circle_fit import fit_circle, fit_circles
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import DIRECTIONS, HeadModel
-from ps_head_driver.kinematics import BrightFieldKinematics
+from ps_head_driver.kinematics import BrightFieldKinematics, axes, tilts
 
 # motor positions at which the inverse looks first; it refines between them
 _SAMPLES = 129
@@ -129,6 +129,45 @@ def _circles(points, radial):  # type: ignore[no-untyped-def]
     return cr, branch, poorness
 
 
+@nb.njit(cache=True)
+def _evaluate(m, motor):  # type: ignore[no-untyped-def]
+    """CR, branch and poorness of the circle at motor positions, each (n,)."""
+    loop, ring, radial, plane_z = motor
+    center, axis = axes(tilts(m, loop), *ring)
+    points, distance = _intersections(center, axis, radial, plane_z)
+    return _circles(points, distance)
+
+
+@nb.njit(cache=True)
+def _narrowed(below, above, side, motor):  # type: ignore[no-untyped-def]
+    """Close in on the end of a branch between two counts; all positions tried, (n,)."""
+    tried = np.empty(0)
+    while above - below > 1:
+        tries = np.round(np.linspace(below, above, _TRIES))
+        branch = _evaluate(tries, motor)[1]
+        last = 0
+        while branch[last + 1] == side:
+            last += 1
+        below, above = tries[last], tries[last + 1]
+        tried = np.concatenate((tried, tries))
+    return tried
+
+
+@nb.njit(cache=True)
+def _closest(low, high, branch, goal, motor):  # type: ignore[no-untyped-def]
+    """Count of a branch whose CR is nearest to a goal, on ever finer grids; the count, its CR."""
+    while True:
+        tries = np.round(np.linspace(low, high, _TRIES))
+        cr, there, _ = _evaluate(tries, motor)
+        best = -1
+        for i in range(_TRIES):
+            if there[i] == branch and (best < 0 or abs(cr[i] - goal) < abs(cr[best] - goal)):
+                best = i
+        if high - low < _TRIES or best < 0:
+            return (tries[best], cr[best]) if best >= 0 else (low, np.inf)
+        low, high = tries[max(best - 1, 0)], tries[min(best + 1, _TRIES - 1)]
+
+
 class CrSolver:
     """Forward and inverse for one head and one plane."""
 
@@ -141,6 +180,9 @@ class CrSolver:
         self._reachable: dict[Branch, tuple[float, float]] = {}
         # the paper's h is C_z at m_0: it says where the plane is, and the plane stays there
         self.plane_z = float(at_home[0, :, 2].mean()) - light_height if light_height else 0.0
+        # what the compiled functions want to know
+        self._compiled = (self._motor.loop, self._motor.ring.arrays, self._motor.ring.radial,
+                          self.plane_z)
 
     # ------------------------------------------------------------------ geometry
 
@@ -159,12 +201,9 @@ class CrSolver:
 
     def evaluate(self, m: NDArray) -> tuple[NDArray, NDArray]:
         """CR (NaN without intersection) and branch at motor positions."""
-        cr, branch, _ = self._evaluate(m)
+        self._motor.check_counts(m)
+        cr, branch, _ = _evaluate(np.asarray(m, np.float64), self._compiled)
         return cr, branch
-
-    def _evaluate(self, m: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """CR, branch, and how badly the points lie on a circle: rms distance over its radius."""
-        return _circles(*self.intersections(m))
 
     # ------------------------------------------------------------------ forward
 
@@ -208,20 +247,11 @@ class CrSolver:
         """Motor positions (ascending whole counts), CR and branch there, branch ends included."""
         low, high = self._motor.limits_counts
         m = np.unique(np.linspace(low, high, _SAMPLES).round())
-        samples = [(m, *self._evaluate(m))]
-        branch = samples[0][2]
-        changes = branch[:-1] != branch[1:]
-        below, above, side = m[:-1][changes], m[1:][changes], branch[:-1][changes]
-        while len(below) and np.any(above - below > 1):      # narrow down every change of branch
-            tries = np.linspace(below, above, _TRIES, axis=1).round()
-            samples.append((tries.ravel(), *self._evaluate(tries.ravel())))
-            there = samples[-1][2].reshape(tries.shape)
-            last = np.argmax(there != side[:, None], axis=1) - 1
-            rows = np.arange(len(below))
-            below, above = tries[rows, last], tries[rows, last + 1]
-        m, *found = (np.concatenate(parts) for parts in zip(*samples, strict=True))
-        m, first = np.unique(m, return_index=True)
-        return self._with_jumps(m, *(values[first] for values in found))
+        branch = _evaluate(m, self._compiled)[1]
+        ends = [_narrowed(m[i], m[i + 1], branch[i], self._compiled)
+                for i in np.flatnonzero(branch[:-1] != branch[1:])]
+        m = np.unique(np.concatenate([m, *ends]))
+        return self._with_jumps(m, *_evaluate(m, self._compiled))
 
     def _with_jumps(self, m: NDArray, cr: NDArray, branch: NDArray, poorness: NDArray,
                     ) -> tuple[NDArray, NDArray, NDArray]:
@@ -244,7 +274,7 @@ class CrSolver:
             if not jumps.any():
                 return m, cr, branch
             between = np.linspace(m[1:-2][jumps], m[2:-1][jumps], 10).round().ravel()
-            added = self._evaluate(between)
+            added = _evaluate(between, self._compiled)
             m, first = np.unique(np.concatenate([m, between]), return_index=True)
             cr, branch, poorness = (np.concatenate([old, new])[first] for old, new in zip(
                 (cr, branch, poorness), added, strict=True))
@@ -269,38 +299,27 @@ class CrSolver:
         """Motor counts of a branch that exists, and CR there, nearest to each wanted CR.
 
         The distance may have several minima. Each lies beside a sample that is a local minimum, so
-        the neighbourhoods of the best few are searched on ever finer grids down to single counts,
-        those of all goals together.
+        the neighbourhoods of the best few are searched down to single counts.
         """
-        # nearest to infinity: the same order as nearest to more than any CR there is
-        wanted = np.minimum(goals, np.nanmax(self.sampled[1]) * 2 + 1)
-
-        def distance(cr: NDArray, branches: NDArray, goal: NDArray) -> NDArray:
-            return np.where(branches == branch, np.abs(cr - goal), np.inf)
-
         m, cr, branches = self.sampled
-        values = distance(cr, branches, wanted[:, None])
-        is_minimum = np.isfinite(values)
-        is_minimum[:, 1:] &= values[:, 1:] <= values[:, :-1]
-        is_minimum[:, :-1] &= values[:, :-1] <= values[:, 1:]
-        order = np.argsort(np.where(is_minimum, values, np.inf), axis=1, kind='stable')[:, :3]
-        owner, place = np.nonzero(np.take_along_axis(is_minimum, order, axis=1))
-        index = order[owner, place]
-        low, high = m[np.maximum(index - 1, 0)], m[np.minimum(index + 1, len(m) - 1)]
-        rows = np.arange(len(index))
-        while True:
-            tries = np.linspace(low, high, _TRIES, axis=1).round()
-            cr, branches, _ = (
-                found.reshape(tries.shape) for found in self._evaluate(tries.ravel()))
-            there = distance(cr, branches, wanted[owner, None])
-            at = np.argmin(there, axis=1)
-            if np.all(high - low < _TRIES):
-                break
-            low = tries[rows, np.maximum(at - 1, 0)]
-            high = tries[rows, np.minimum(at + 1, _TRIES - 1)]
-        best = [rows[owner == i][np.argmin(there[rows, at][owner == i])]
-                for i in range(len(goals))]
-        return [int(tries[i, at[i]]) for i in best], [float(cr[i, at[i]]) for i in best]
+        # nearest to infinity: the same order as nearest to more than any CR there is
+        wanted = np.minimum(goals, np.nanmax(cr) * 2 + 1)
+        found = [self._nearest_one(m, np.where(branches == branch, np.abs(cr - goal), np.inf),
+                                   branch, float(goal)) for goal in wanted]
+        return [int(count) for count, _ in found], [value for _, value in found]
+
+    def _nearest_one(self, m: NDArray, distance: NDArray, branch: Branch, goal: float,
+                     ) -> tuple[float, float]:
+        """Count and CR nearest to a goal, from the distances of the samples to it."""
+        is_minimum = np.isfinite(distance)
+        is_minimum[1:] &= distance[1:] <= distance[:-1]
+        is_minimum[:-1] &= distance[:-1] <= distance[1:]
+        places = np.flatnonzero(is_minimum)
+        places = places[np.argsort(distance[places], kind='stable')[:3]]
+        tried: list[tuple[float, float]] = [
+            _closest(m[max(i - 1, 0)], m[min(i + 1, len(m) - 1)], int(branch), goal,
+                     self._compiled) for i in map(int, places)]
+        return min(tried, key=lambda one: abs(one[1] - goal))
 
     def inverse(self, convergence_radius: float, branch: Branch = Branch.ANY) -> CrSolution:
         """See :func:`inverse`."""
@@ -314,7 +333,7 @@ class CrSolver:
         for candidate in tried:
             if not (self.sampled[2] == candidate).any():
                 continue
-            # the ends of the interval are kept; the first time all are searched together
+            # the ends of the interval are searched once
             goals = [wanted] if candidate in self._reachable else [wanted, 0.0, np.inf]
             counts, found = self._nearest(candidate, goals)
             if len(goals) > 1:

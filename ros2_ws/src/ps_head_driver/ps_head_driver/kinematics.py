@@ -54,8 +54,9 @@ class PanelRing:
         shift = np.array([panel.shift for panel in own])
         self.hinges = ((hinge.r + shift[:, :1]) * self.radial + shift[:, 1:2] * tangential
                        + (hinge.z + shift[:, 2:]) * _VERTICAL)
-        self._along, self._out = ((field.arm.along, field.arm.out)
-                                  if isinstance(field, BrightField) else (0.0, 0.0))
+        arm = (field.arm.along, field.arm.out) if isinstance(field, BrightField) else (0.0, 0.0)
+        #: what the compiled function axes() wants to know
+        self.arrays = (self._tilt_offset, self.hinges, self._outward, *arm)
 
     def axes(self, tilt: ArrayLike) -> tuple[NDArray, NDArray]:
         """Centres and unit axes at nominal tilts.
@@ -64,8 +65,7 @@ class PanelRing:
         :returns: (..., 4, 3) and (..., 4, 3).
         """
         tilt = np.asarray(tilt, np.float64)
-        center, axis = _axes(np.atleast_1d(tilt).ravel(), self._tilt_offset, self.hinges,
-                             self._outward, self._along, self._out)
+        center, axis = axes(np.atleast_1d(tilt).ravel(), *self.arrays)
         return center.reshape(*tilt.shape, 4, 3), axis.reshape(*tilt.shape, 4, 3)
 
     def pose(self, direction: Direction, tilt: float) -> PanelPose:
@@ -78,7 +78,7 @@ class PanelRing:
 
 
 @nb.njit(cache=True)
-def _axes(tilt, offset, hinge, outward, along, out):  # type: ignore[no-untyped-def]
+def axes(tilt, offset, hinge, outward, along, out):  # type: ignore[no-untyped-def]
     """Centres and axes (n, 4, 3) at tilts (n,); the panels' own data as in PanelRing."""
     center, axis = np.empty((len(tilt), 4, 3)), np.empty((len(tilt), 4, 3))
     for i in range(len(tilt)):
@@ -102,6 +102,14 @@ def _crank_angles(dz, dx, radius, rod, branch):  # type: ignore[no-untyped-def]
         angle[i] = np.nan if abs(cosine) > 1 else (
             branch * math.acos(cosine) - math.atan2(dz[i], dx))
     return angle
+
+
+@nb.njit(cache=True)
+def tilts(m, loop):  # type: ignore[no-untyped-def]
+    """Tilts (n,) at motor positions (n,); ``loop`` as in BrightFieldKinematics."""
+    z, dz_dm, m0, dx, radius, rod, branch, angle_at_m0, tilt_at_m0 = loop
+    turned = _crank_angles(z + dz_dm * (m - m0), dx, radius, rod, branch) - angle_at_m0
+    return tilt_at_m0 - ((math.pi - turned) % (2 * math.pi) - math.pi)
 
 
 def _turned(azimuth: NDArray) -> tuple[NDArray, NDArray]:
@@ -141,6 +149,10 @@ class BrightFieldKinematics:
         chosen = int(np.argmin([abs(tilt - middle) for tilt in tilts]))
         self._branch, self._tilt_at_m0 = (-1, 1)[chosen], float(tilts[chosen])
         self._angle_at_m0 = float(candidates[chosen])
+        #: what the compiled function tilts() wants to know
+        self.loop = (self._slider.z_at_m0 - float(self._hinge[1]), self._dz_dm,
+                     float(self._slider.m0_counts), self._dx, self._radius, self._rod,
+                     self._branch, self._angle_at_m0, self._tilt_at_m0)
         self.limits_counts = self._usable_interval()
 
     def _height(self, m_counts: ArrayLike) -> Any:
@@ -199,8 +211,8 @@ class BrightFieldKinematics:
         :raises PsError: CR_OUT_OF_LIMITS.
         """
         self.check_counts(m_counts)
-        angle = self._crank_angle(self._height(m_counts), self._branch)
-        return self._tilt_at_m0 + _wrap(angle - self._angle_at_m0)
+        m = np.asarray(m_counts, np.float64)
+        return tilts(np.atleast_1d(m).ravel(), self.loop).reshape(m.shape)[()]
 
     def dtilt_dm(self, m_counts: ArrayLike) -> Any:
         """Exact derivative of the tilt, rad per count."""

@@ -132,8 +132,8 @@ def _content(summary: Summary, parts: list[dict[str, Any]], session: Session) ->
         'title': about.get('session_id') or session.folder.name, 'about': about,
         'start': f'{start:%d %B %Y, %H:%M:%S}', 'duration': _clock(summary.duration),
         'tiles': [
-            ('parts', str(len({entry.name for entry in entries}))),
-            ('stacks', str(len(entries))), ('faults', str(faults)),
+            _counted(len({entry.name for entry in entries}), 'part'),
+            _counted(len(entries), 'stack'), _counted(faults, 'fault'),
             ('valid pixels, median', _median([r['valid_fraction'] for r in results], '{:.1%}')),
             ('last exposure to result, median', _median(waits, '{:.2f} s'))],
         'faults': faults, 'parts': parts, 'left_out': len(entries) - len(parts),
@@ -210,6 +210,10 @@ def _timeline(summary: Summary) -> dict[str, Any]:
 def _event(event: Event) -> dict[str, Any]:
     return {'time': _clock(event.time), 'kind': event.kind, 'source': event.source,
             'text': event.text}
+
+
+def _counted(count: int, noun: str) -> tuple[str, str]:
+    return (noun if count == 1 else f'{noun}s'), str(count)
 
 
 def _median(values: Sequence[float], form: str) -> str:

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from ps_inspection.access_policy import Rights, from_xml, rights_of, to_xml
+from ps_inspection.graph import NODES
 
 SECURITY = Path(__file__).resolve().parents[1] / 'config' / 'security'
 RIGHTS = Rights(
@@ -54,6 +55,12 @@ def test_other_policies_are_refused(old, new):
 def test_every_enclave_is_that_of_its_node(name):
     for rights in from_xml((SECURITY / name).read_text()):
         assert rights.enclave == f'{rights.namespace}/{rights.node}'
+
+
+def test_every_node_of_the_cell_has_its_rights():
+    allowed = from_xml((SECURITY / 'cell.policy.xml').read_text())
+    assert {rights.node for rights in allowed} == {node.executable for node in NODES}, (
+        'run scripts/security_policy.py')
 
 
 def test_firewall_ports_are_those_of_the_domain():

@@ -4,7 +4,9 @@ import json
 from pathlib import Path
 import sys
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
@@ -91,10 +93,23 @@ def report(results: list[Result]) -> dict[str, object]:
 
 def write_figure(result: Result, maps: Maps, folder: Path) -> Path:
     """Write true, LS and STV normals above the error maps; returns the file."""
-    from matplotlib.figure import Figure
     folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f'{result.name}_{result.lights}.png'
+    if not cv2.imwrite(str(path), np.ascontiguousarray(figure_of(result, maps)[..., ::-1])):
+        raise OSError(f'{path} cannot be written')
+    return path
+
+
+def figure_of(result: Result, maps: Maps, picture: NDArray | None = None) -> NDArray[np.uint8]:
+    """True, LS and STV normals above the error maps, as RGB.
+
+    :param picture: one of the frames, to be shown below the true normals.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
     height, width = maps.truth.shape[:2]
     figure = Figure(figsize=(9.6, 0.7 + 6.2 * height / width), layout='constrained')
+    canvas = FigureCanvasAgg(figure)
     axes = figure.subplots(2, 3)
     figure.suptitle(f'{result.name}, {result.lights} lights')
     panels = {'truth': maps.truth, 'LS': maps.normal['ls'], 'STV': maps.normal['stv']}
@@ -104,19 +119,21 @@ def write_figure(result: Result, maps: Maps, folder: Path) -> Path:
         colours[outside] = 1
         axis.imshow(colours)
         axis.set_title(title)
-    picture = None
+    if picture is not None:
+        axes[1, 0].imshow(picture, cmap='gray')
+        axes[1, 0].set_title('one of the pictures', fontsize='medium')
+    drawn = None
     for axis, method in zip(axes[1, 1:], METHODS, strict=True):
-        picture = axis.imshow(maps.error[method], vmin=0, vmax=ERROR_SCALE, cmap='inferno')
+        drawn = axis.imshow(maps.error[method], vmin=0, vmax=ERROR_SCALE, cmap='inferno')
         error = result.errors[method]
         axis.set_title(f'mean {error.mean:.2f}°, p90 {error.p90:.2f}°', fontsize='medium')
     for axis in axes.flat:
         axis.set_axis_off()
-    assert picture is not None
-    figure.colorbar(picture, ax=axes[1, 0], location='left', label='angular error in degrees',
+    assert drawn is not None
+    figure.colorbar(drawn, ax=axes[1, 0], location='left', label='angular error in degrees',
                     fraction=0.1)
-    path = folder / f'{result.name}_{result.lights}.png'
-    figure.savefig(path, dpi=100)
-    return path
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 if __name__ == '__main__':

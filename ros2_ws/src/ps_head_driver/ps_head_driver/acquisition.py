@@ -47,7 +47,7 @@ class Settings:
     :param frame_timeout: longest wait for the frames of a finished program.
     :param time_tolerance: of the times between frames and between strobes.
     :param host_margin: a light that the host steps stays on this much longer than the exposure.
-    :param max_motion: largest shift between two frames, px; 0: any.
+    :param max_motion: largest shift between two frames, px; 0: it is not measured.
     :param max_motor_motion: largest movement of the panels within a program, counts.
     """
 
@@ -262,12 +262,12 @@ def _check_motor(lights: Sequence[Light], most_counts: int) -> None:
 
 
 def _check_motion(frames: Sequence[Frame], lights: Sequence[Light], most_px: float) -> float:
-    """Largest shift between frames, px; NaN if they show too little to tell."""
+    """Largest shift between frames, px; NaN if not wanted, or if they show too little to tell."""
     lit = [i for i, light in enumerate(lights) if light.panel is not Panel.NONE]
-    if len(lit) < 2:
+    if len(lit) < 2 or not most_px:
         return math.nan
     motion = frame_motion.measure([frames[i].image for i in lit], [lights[i] for i in lit])
-    if most_px and motion > most_px:
+    if motion > most_px:
         raise PsError(ErrorCode.SEQUENCER_MOTION,
                       f'the picture moved by {motion:.1f} px during the sequence (allowed: '
                       f'{most_px:g}); wait until robot and part stand still, or raise max_motion')

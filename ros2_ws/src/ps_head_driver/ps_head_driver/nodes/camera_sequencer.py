@@ -55,7 +55,7 @@ PARAMETERS = [
     Parameter('host_margin', 0.2, 'Sequencing host: a light stays on this much longer than the '
               'exposure', 's', 0.02, 1.5),
     Parameter('max_motion', 3.0, 'Largest shift between two frames of a stack, measured in them; '
-              'a stack that moved more is refused; 0: none is', 'px', 0.0, 100.0),
+              'a stack that moved more is refused; 0: not measured', 'px', 0.0, 100.0),
     Parameter('max_motor_motion', 4, 'Largest movement of the panels within a strobe program',
               'counts', 0, 1000),
     Parameter('flat_height', 256, 'Rows of a stored flat-field picture', 'px', 16, 4096),
@@ -379,7 +379,7 @@ def _new_id(kind: str) -> str:
 
 
 def _motion_text(motion_px: float) -> str:
-    return 'not measurable' if math.isnan(motion_px) else f'{motion_px:.1f} px'
+    return 'not known' if math.isnan(motion_px) else f'{motion_px:.1f} px'
 
 
 def _fit(camera: CameraGeometry, shape: tuple[int, int]) -> CameraGeometry:

@@ -13,7 +13,6 @@ from std_srvs.srv import Trigger
 
 from ps_calibration.calibrate import calibrate
 from ps_calibration.catalogue import list_calibrations
-from ps_calibration.nodes.stack_source import StackSource
 from ps_calibration.report import gather, report, write_report
 from ps_calibration.ring_pictures import common_camera
 from ps_calibration.ring_target import RingTarget, default_target_path, load_target
@@ -27,6 +26,7 @@ from ps_head_driver.paths import confined
 from ps_head_driver.ros_support import Parameter, answers
 from ps_head_driver.stack import Panel, Stack
 from ps_head_driver.stack_folder_writer import write_stack
+from ps_head_driver.stack_source import StackSource
 from ps_interfaces import msg as ps
 from ps_interfaces.action import AcquireStack, CalibrateRing
 from ps_interfaces.srv import CalibrationFile
@@ -68,7 +68,8 @@ class RingCalibration(Node):
         self._busy, self._computing = threading.Lock(), threading.Lock()
         self._cancelled = threading.Event()
         self._running: ServerGoalHandle | None = None
-        self._source = StackSource(self, self._cancelled)
+        self._source = StackSource(self, ErrorCode.CALIBRATION_CAPTURE_FAILED,
+                                   ErrorCode.CALIBRATION_CANCELLED)
         self._publisher = self.create_publisher(
             ps.HeadCalibration, 'calibration', ros_support.LATCHED)
         self.create_subscription(
@@ -233,7 +234,7 @@ class RingCalibration(Node):
         result.calibration = calibration_to_message(calibration, self.head)
         result.message = f'{calibration.verdict}, written to {path}, report beside it'
         if request.apply and calibration.verdict == 'OK':
-            self._source.check_cancelled()
+            self._source.check(self._cancelled.is_set)
             self.active, self.refused = calibration, ''
             self._publish()
             result.message += ' and active'
@@ -253,8 +254,9 @@ class RingCalibration(Node):
                     moving = capture.state == AcquireStack.Feedback.MOVING
                     self._feedback(goal, state.MOVING if moving else state.CAPTURING, number,
                                    len(radii), hint)
-                stack = self._source.take(self._steps(radius), self.parameters['capture_timeout'],
-                                          on_feedback)
+                stack = self._source.take(
+                    AcquireStack.Goal(steps=self._steps(radius), part_id='ring calibration'),
+                    self.parameters['capture_timeout'], self._cancelled.is_set, on_feedback)
                 if keep is not None:
                     _keep(stack, keep / f'position_{number + 1}')
                 hint = setup_hint(stack, target, common_camera([stack], self.head))
@@ -286,7 +288,7 @@ class RingCalibration(Node):
         worker = threading.Thread(target=work, name='calibration', daemon=True)
         worker.start()
         while worker.is_alive():
-            self._source.check_cancelled()
+            self._source.check(self._cancelled.is_set)
             worker.join(_POLL_S)
         if isinstance(outcome[0], Exception):
             raise outcome[0]

@@ -21,8 +21,8 @@ from ps_inspection.session_output import (
     stack_folder_name,
     whole_folder,
 )
-from ps_reconstruction.cli.ps_reconstruct import write_arrays
 from ps_reconstruction.pipeline import Options, Reconstruction, reconstruct
+from ps_reconstruction.result_files import write_arrays
 from ps_reconstruction.session_format import STACK_TYPE, stack_id_of
 from ps_reconstruction.session_reader import Place, Scan, Session, decode
 

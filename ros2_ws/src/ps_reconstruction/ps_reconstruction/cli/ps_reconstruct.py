@@ -8,19 +8,15 @@ import sys
 import time
 from typing import Any
 
-import cv2
 import numpy as np
 from rich.console import Console
 
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.stack import Stack, Truth, angular_error_deg
 from ps_head_driver.stack_folder import read_stack
-from ps_reconstruction import preview
-from ps_reconstruction.pipeline import METHODS, OUTPUTS, Options, Reconstruction, reconstruct
+from ps_reconstruction.pipeline import METHODS, OUTPUTS, Options, reconstruct
+from ps_reconstruction.result_files import write_result
 from ps_reconstruction.session_reader import Scan, Session, is_session
-
-ARRAYS = ('normal', 'slope', 'albedo', 'height', 'curvature', 'shape', 'confidence', 'reason',
-          'mask')
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -134,48 +130,6 @@ def _process(stack: Stack, truth: Truth | None, out: Path, options: argparse.Nam
         console.print('angular error: mean {mean:.3f}, median {median:.3f}, p90 {p90:.3f} deg'
                       .format(**error))
     return report
-
-
-def write_result(result: Reconstruction, out: Path) -> None:
-    """Write result.npz for computing and PNG files for looking.
-
-    16 bit: normal (n + 1) / 2, slope within +-1, albedo to its 99.9th percentile, height from its
-    lowest to its highest value; 8 bit: shape, confidence and the pictures for people.
-    """
-    write_arrays(result, out)
-    assert result.slope is not None
-    assert result.albedo is not None
-    assert result.height is not None
-    white = float(np.nanpercentile(result.albedo, 99.9)) if result.mask.any() else 1.0
-    slope = np.dstack([preview.grey16(result.slope[..., a], -1, 1) for a in (0, 1)]
-                      + [np.zeros(result.mask.shape, np.uint16)])
-    low, high = ((float(np.nanmin(result.height)), float(np.nanmax(result.height)))
-                 if result.mask.any() else (0.0, 1.0))
-    title = 'Height' if result.metric else 'Height, relative'
-    pictures = {
-        'normal': preview.normal16(result.normal), 'slope': slope,
-        'albedo': preview.grey16(result.albedo, 0.0, white),
-        'height': preview.grey16(result.height, low, high),
-        'shape': result.shape, 'confidence': result.confidence,
-        'slope_view': preview.slope_preview(result.slope),
-        'height_view': preview.height_view(
-            result.height, result.pixel_pitch, metric=result.metric, title=title)}
-    for name, picture in pictures.items():
-        if picture is None:
-            continue
-        bgr = picture[..., ::-1] if picture.ndim == 3 else picture
-        # fast compression: the strong one takes longer than the reconstruction
-        if not cv2.imwrite(str(out / f'{name}.png'), np.ascontiguousarray(bgr),
-                           [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-            raise OSError(f'{out / name}.png cannot be written')
-
-
-def write_arrays(result: Reconstruction, out: Path) -> None:
-    """Write result.npz with what of ARRAYS there is."""
-    out.mkdir(parents=True, exist_ok=True)
-    arrays = {name: getattr(result, name) for name in ARRAYS}
-    # not compressed: that takes five times as long as the reconstruction for a tenth of the size
-    np.savez(out / 'result.npz', **{k: v for k, v in arrays.items() if v is not None})
 
 
 def _number(value: float) -> float | None:

@@ -24,6 +24,7 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
+            'inspection = ps_inspection.nodes.inspection:main',
             'session_recorder = ps_inspection.nodes.session_recorder:main',
             'ps_cell = ps_inspection.cli.ps_cell:main',
             'ps_demo = ps_inspection.cli.ps_demo:main',

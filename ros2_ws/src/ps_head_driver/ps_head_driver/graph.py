@@ -89,6 +89,7 @@ _HANDED_ON = {argument.name: argument for argument in (
     Argument('scene', '', 'scene that camera:=fake renders'),
     Argument('calibration_file', '', 'head calibration that is active from the start'),
     Argument('session_folder', '', 'folder that sessions are recorded into'),
+    Argument('output_folder', '', 'folder that files of inspections are written into'),
 )}
 
 

@@ -3,7 +3,7 @@
 For robot programs, the demo and tests. Everything goes through topics, services and actions, as
 anybody else would use them.
 """
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 import threading
 import time
@@ -18,6 +18,7 @@ from std_srvs.srv import Trigger
 
 from ps_head_driver import ros_support
 from ps_head_driver.errors import ErrorCode, PsError
+from ps_inspection.running_goal import RunningGoal
 from ps_interfaces import msg as ps
 from ps_interfaces import srv
 from ps_reconstruction.conversions import IMAGE_TOPICS
@@ -130,6 +131,11 @@ class CellClient:
         if not response.success:
             raise _error_of(response)
         return response
+
+    def send(self, kind: Any, name: str, goal: Any,
+             on_feedback: Callable[[Any], None] = lambda _: None) -> RunningGoal:
+        """Send a goal to an action of the cell; see RunningGoal for what to do with it."""
+        return RunningGoal(self.node, kind, name, goal, on_feedback)
 
     def home(self) -> None:
         """Home the motor and wait until the head is ready."""

@@ -7,4 +7,5 @@ from ps_reconstruction.graph import NODES as RECONSTRUCTION_NODES
 NODES = (
     *HEAD_NODES, *RECONSTRUCTION_NODES, *CALIBRATION_NODES,
     NodeSpec('ps_inspection', 'session_recorder', ('session_folder',)),
+    NodeSpec('ps_inspection', 'inspection', ('session_folder', 'output_folder')),
 )

@@ -1,0 +1,63 @@
+"""One goal of an action as plain blocking calls, for CellClient."""
+from collections.abc import Callable
+import threading
+from typing import Any
+
+from rclpy.action import ActionClient
+from rclpy.node import Node
+
+from ps_head_driver.errors import ErrorCode, PsError
+
+
+class RunningGoal:
+    """A goal that has been sent; the node must be spun by another thread.
+
+    :param on_feedback: called with each feedback, from the spinning thread.
+    :raises PsError: INSPECTION_INTERNAL if nobody serves the action.
+    """
+
+    def __init__(self, node: Node, kind: Any, name: str, goal: Any,
+                 on_feedback: Callable[[Any], None] = lambda _: None,
+                 timeout: float = 10.0) -> None:
+        self.feedback: list[Any] = []
+        self._name, self._on_feedback = name, on_feedback
+        self._changed = threading.Condition()
+        self._client = ActionClient(node, kind, name)
+        if not self._client.wait_for_server(timeout):
+            self._client.destroy()
+            raise PsError(ErrorCode.INSPECTION_INTERNAL,
+                          f'action {name} is not there; is its node running?')
+        self._handle = self._done(self._client.send_goal_async(goal, self._keep), timeout)
+        self._result = self._handle.get_result_async()
+
+    def _keep(self, message: Any) -> None:
+        with self._changed:
+            self.feedback.append(message.feedback)
+            self._changed.notify_all()
+        self._on_feedback(message.feedback)
+
+    def _done(self, future: Any, timeout: float) -> Any:
+        done = threading.Event()
+        future.add_done_callback(lambda _: done.set())
+        if not done.wait(timeout):
+            raise PsError(ErrorCode.INSPECTION_INTERNAL,
+                          f'action {self._name}: no answer within {timeout:g} s')
+        return future.result()
+
+    def wait_for(self, condition: Callable[[Any], bool], timeout: float) -> bool:
+        """Wait for a feedback of a kind; whether one came, also before."""
+        with self._changed:
+            return self._changed.wait_for(lambda: any(map(condition, self.feedback)), timeout)
+
+    def cancel(self, timeout: float = 10.0) -> None:
+        """Ask for the end; the result then says CANCELLED."""
+        self._done(self._handle.cancel_goal_async(), timeout)
+
+    def result(self, timeout: float = 60.0) -> Any:
+        """The result, also one without success.
+
+        :raises PsError: INSPECTION_INTERNAL if it does not come in time.
+        """
+        answer = self._done(self._result, timeout)
+        self._client.destroy()
+        return answer.result

@@ -17,6 +17,7 @@ from geometry_msgs.msg import PoseStamped
 import rclpy
 from rclpy.action import ActionClient
 from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
 
 from ps_interfaces.action import Inspect
 
@@ -40,10 +41,12 @@ class Robot:
 class Inspection:
     """One goal on its way."""
 
-    def __init__(self, client: ActionClient, goal: Inspect.Goal) -> None:
+    def __init__(self, node: Node, client: ActionClient, goal: Inspect.Goal) -> None:
         self.started = time.monotonic()
         self.may_move, self.finished = threading.Event(), threading.Event()
-        client.send_goal_async(goal, self._on_feedback).add_done_callback(self._on_accepted)
+        # sent by the thread that spins: rclpy can lose an answer that overtakes the sender
+        node.executor.create_task(lambda: client.send_goal_async(
+            goal, self._on_feedback).add_done_callback(self._on_accepted))
 
     def _on_feedback(self, message: object) -> None:
         if message.feedback.safe_to_move:
@@ -58,12 +61,12 @@ class Inspection:
         self.finished.set()
 
 
-def run(client: ActionClient, robot: Robot, positions: int) -> list[dict]:
+def run(node: Node, client: ActionClient, robot: Robot, positions: int) -> list[dict]:
     """Inspect all positions; one row a position, times in s."""
     inspections, rows, begin = [], [], time.monotonic()
     for number in range(positions):
         pose = robot.move_to(number)
-        inspections.append(Inspection(client, Inspect.Goal(
+        inspections.append(Inspection(node, client, Inspect.Goal(
             part_id=f'part-7/{number + 1}', head_pose=pose, outputs=['shape'],
             illumination=Inspect.Goal.GIVEN, convergence_radius=0.03)))
         if not inspections[-1].may_move.wait(120):
@@ -104,7 +107,7 @@ def main() -> int:
         if not client.wait_for_server(timeout_sec=30):
             print('no cell: the action inspect is not there')
             return 1
-        rows = run(client, Robot(options.move_time), options.positions)
+        rows = run(node, client, Robot(options.move_time), options.positions)
     finally:
         rclpy.shutdown()
         spinner.join()

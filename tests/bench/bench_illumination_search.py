@@ -20,7 +20,7 @@ from ps_reconstruction.pipeline import reconstruct
 
 HEAD = load_head(nominal_head_path())
 DARK_FIELD_TILT = 1.3
-POSITIONS = 17
+POSITIONS = 9
 SCALE = 0.25
 # those the search was asked to be good at, then steeper ones that are hard for the dark field
 ISSUE = ('plate', 'boss', 'glossy_plate', 'copper', 'scratches', 'weld', 'orange_peel')

@@ -5,12 +5,12 @@ import threading
 import time
 from typing import Any
 
-from rclpy.action import ActionClient
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 
 from ps_head_driver import ros_support
+from ps_head_driver.action_client import ActionClient
 from ps_head_driver.conversions import message_to_stack
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.stack import Stack

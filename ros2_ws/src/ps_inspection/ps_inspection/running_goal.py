@@ -3,9 +3,9 @@ from collections.abc import Callable
 import threading
 from typing import Any
 
-from rclpy.action import ActionClient
 from rclpy.node import Node
 
+from ps_head_driver.action_client import ActionClient
 from ps_head_driver.errors import ErrorCode, PsError
 
 

@@ -23,6 +23,7 @@ RING = (Panel.E, Panel.N, Panel.W, Panel.S)
 POSITIONS = 17           # of the motor that a search chooses from
 _ANSWER_S, _MOVE_S = 10.0, 60.0
 _ANY_CR = 0.06           # m; asked for only to learn what is reachable
+_LEAST_CR = 0.001        # m; where nobody says, the steps of the motor are too coarse for less
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,7 @@ class IlluminationProber:
         if cr_min == cr_max == 0:
             reach = self._ask(self._solve, kind(
                 mode=kind.INVERSE, convergence_radius=_ANY_CR, branch=kind.BRANCH_UNCROSSED))
-            cr_min, cr_max = reach.reachable_min, reach.reachable_max
+            cr_min, cr_max = max(reach.reachable_min, _LEAST_CR), reach.reachable_max
         if not (np.isfinite([cr_min, cr_max]).all() and 0 <= cr_min <= cr_max and cr_max > 0):
             raise PsError(ErrorCode.INSPECTION_BAD_REQUEST,
                           f'cr_min, cr_max: {cr_min:g} to {cr_max:g} m is no interval')

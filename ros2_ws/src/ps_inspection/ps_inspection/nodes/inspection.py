@@ -149,15 +149,15 @@ class InspectionNode(Node):
         def work() -> None:
             check_request(goal.request)
             stage = Inspect.Feedback
-            with self._exclusive() as capture_over:
+            with self._exclusive() as capture_over, self._outputs.wanted(goal.request.outputs):
                 _tell(goal, stage.WAITING)
                 with self.pipeline.place(lambda: goal.is_cancel_requested):
                     with self._camera_of(goal):
                         self._capture(goal, result, capture_over)
-                    _tell(goal, stage.RECONSTRUCTING, True)
                     capture_over()
+                    _tell(goal, stage.RECONSTRUCTING, True)
                     self._reconstruct(goal, result)
-            self._deliver(goal, result)
+                self._deliver(goal, result)
 
         self._finish(goal, result, work)
         if result.error_code != ErrorCode.INSPECTION_BUSY:
@@ -220,7 +220,6 @@ class InspectionNode(Node):
                               'nobody publishes reconstruction_info; is the reconstruction node '
                               'running?')
             time.sleep(0.1)
-        self._outputs.want(request.outputs)
         take = AcquireStack.Goal(
             part_id=request.part_id, head_pose=request.head_pose, recipe=request.recipe,
             ambient_frame=request.ambient_frame)
@@ -238,7 +237,8 @@ class InspectionNode(Node):
 
         def on_feedback(capture: AcquireStack.Feedback) -> None:
             moving = capture.state == state.MOVING
-            if capture.state != state.PUBLISHED:
+            # feedback may be overtaken by the result
+            if capture.state != state.PUBLISHED and not result.stack_id:
                 _tell(goal, stage.ILLUMINATING if moving else stage.CAPTURING,
                       capture.safe_to_move)
             if capture.safe_to_move:

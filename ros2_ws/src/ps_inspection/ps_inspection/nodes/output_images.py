@@ -1,6 +1,7 @@
 """Output images of the reconstruction for whoever wants files of a stack."""
-from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial
 import threading
 import time
@@ -31,35 +32,44 @@ class OutputImages:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._group = ReentrantCallbackGroup()
-        self._subscriptions: dict[str, tuple[Subscription, float]] = {}
+        self._subscriptions: dict[str, Subscription] = {}
+        self._users: Counter[str] = Counter()
+        self._used: dict[str, float] = {}      # when the last user went
         self._images: dict[str, OrderedDict[Stamp, Image]] = {}
         self._change = threading.Condition()
         node.create_timer(5.0, self._end_idle)
 
-    def want(self, names: Iterable[str], timeout: float = 5.0) -> None:
-        """Make sure that the images of stacks to come arrive.
+    @contextmanager
+    def wanted(self, names: Iterable[str], timeout: float = 5.0) -> Iterator[None]:
+        """Inside, images of stacks to come arrive, for :meth:`fetch`.
 
         :raises PsError: INSPECTION_RECONSTRUCTION_LOST if nobody publishes them.
         """
-        deadline, new = time.monotonic() + timeout, False
-        for name in names:
-            topic = IMAGE_TOPICS[name]
+        names = sorted(set(names))
+        with self._change:
+            new = [name for name in names if name not in self._subscriptions]
+            for name in new:
+                self._images[name] = OrderedDict()
+                self._subscriptions[name] = self._node.create_subscription(
+                    Image, IMAGE_TOPICS[name], partial(self._on_image, name),
+                    ros_support.RELIABLE, callback_group=self._group)
+            self._users.update(names)
+        try:
+            deadline = time.monotonic() + timeout
+            for topic in (IMAGE_TOPICS[name] for name in names):
+                while not self._node.count_publishers(topic):
+                    if time.monotonic() > deadline:
+                        raise PsError(
+                            ErrorCode.INSPECTION_RECONSTRUCTION_LOST,
+                            f'nobody publishes {topic}; is the reconstruction running?')
+                    time.sleep(_POLL_S)
+            if new:
+                time.sleep(_DISCOVERY_S)
+            yield
+        finally:
             with self._change:
-                subscription = self._subscriptions.get(name, (None, 0.0))[0]
-                if subscription is None:
-                    new = True
-                    self._images[name] = OrderedDict()
-                    subscription = self._node.create_subscription(
-                        Image, topic, partial(self._on_image, name), ros_support.RELIABLE,
-                        callback_group=self._group)
-                self._subscriptions[name] = (subscription, time.monotonic())
-            while not self._node.count_publishers(topic):
-                if time.monotonic() > deadline:
-                    raise PsError(ErrorCode.INSPECTION_RECONSTRUCTION_LOST,
-                                  f'nobody publishes {topic}; is the reconstruction running?')
-                time.sleep(_POLL_S)
-        if new:
-            time.sleep(_DISCOVERY_S)
+                self._users.subtract(names)
+                self._used |= dict.fromkeys(names, time.monotonic())
 
     def _on_image(self, name: str, message: Image) -> None:
         with self._change:
@@ -89,15 +99,14 @@ class OutputImages:
                                       'after the reconstruction')
                     self._change.wait(_POLL_S)
                 message = self._images[name].pop(stamp)
-                self._subscriptions[name] = (self._subscriptions[name][0], time.monotonic())
             image = message_to_image(message)
             found[name] = optical_to_plane(image) if name == 'normal' else image
         return found
 
     def _end_idle(self) -> None:
+        # not at once: the next part will want the same
         with self._change:
-            for name, (subscription, used) in list(self._subscriptions.items()):
-                if time.monotonic() - used > _IDLE_S:
-                    self._node.destroy_subscription(subscription)
-                    del self._subscriptions[name]
+            for name in list(self._subscriptions):
+                if not self._users[name] and time.monotonic() - self._used[name] > _IDLE_S:
+                    self._node.destroy_subscription(self._subscriptions.pop(name))
                     self._images[name].clear()

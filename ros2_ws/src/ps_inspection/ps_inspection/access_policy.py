@@ -10,6 +10,8 @@ import time
 from typing import Any
 from xml.etree import ElementTree as Xml
 
+from ps_inspection.inspection_request import QUANTITIES
+
 VERSION = '0.2.0'
 # right: (element around the names, element of one name, attribute)
 _KINDS = {
@@ -56,6 +58,8 @@ ON_DEMAND = (
         'albedo', 'confidence', 'curvature', 'height', 'normal', 'shape', 'slope')),
     ('camera_sequencer', 'subscribe', 'camera/image_raw'),       # with camera:=topic
     ('camera_sequencer', 'subscribe', 'camera/camera_info'),
+    ('inspection', 'subscribe', 'stack'),                        # while it searches
+    *(('inspection', 'subscribe', f'{name}/image') for name in QUANTITIES),    # for files
 )
 
 

@@ -3,9 +3,9 @@ from typing import Any
 
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.stack import Mode
-from ps_reconstruction.conversions import IMAGE_TOPICS
+from ps_reconstruction.pipeline import OUTPUTS
 
-QUANTITIES = tuple(name for name in IMAGE_TOPICS if name != 'preview')
+QUANTITIES = tuple(name for name in OUTPUTS if name not in ('preview', 'roughness'))
 AS_IS, GIVEN, SEARCH = 0, 1, 2      # as in Inspect.action
 
 

@@ -16,6 +16,7 @@ from std_msgs.msg import String
 
 from ps_head_driver import ros_support
 from ps_head_driver.errors import ErrorCode, PsError
+from ps_head_driver.paths import confined
 from ps_head_driver.ros_support import Parameter
 from ps_head_driver.stack import Mode
 from ps_head_driver.stack_source import StackSource
@@ -268,8 +269,10 @@ class InspectionNode(Node):
             arrays = self._outputs.fetch(
                 names, (stamp.sec, stamp.nanosec), self.parameters['output_timeout'],
                 lambda: goal.is_cancel_requested)
-            folder = _folder(self.parameters['output_folder'], 'PS_OUTPUT_FOLDER',
-                             '~/ps_inspections') / result.stack_id
+            # the stack's name came over the network
+            folder = confined(
+                _folder(self.parameters['output_folder'], 'PS_OUTPUT_FOLDER', '~/ps_inspections'),
+                result.stack_id, 'stack_id', ErrorCode.INSPECTION_WRITE_FAILED)
             try:
                 files = write_quantities(arrays, folder)
             except OSError as error:

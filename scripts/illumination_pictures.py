@@ -13,7 +13,7 @@ matplotlib.use('Agg')
 import matplotlib.pyplot as plt
 
 from ps_head_driver.convergence_radius import inverse
-from ps_head_driver.fake.renderer import make_renderer
+from ps_head_driver.fake.renderer import OFF, make_renderer
 from ps_head_driver.head_model import load_head, nominal_head_path
 from ps_head_driver.kinematics import lights_at
 from ps_head_driver.stack import Mode, Stack, angular_error_deg
@@ -40,17 +40,17 @@ def draw(scene: str, title: str, gain: float) -> None:
     figure.suptitle(title, fontsize=13)
     for row, mode in enumerate((Mode.BRIGHT_FIELD, Mode.DARK_FIELD)):
         images = []
-        for i, one in enumerate(np.eye(4)):
-            levels = (one, np.zeros(4)) if mode == Mode.BRIGHT_FIELD else (np.zeros(4), one)
-            images.append(renderer.render(solution.tilt, DARK_FIELD_TILT, *levels,
+        for i, one in enumerate(np.eye(4).tolist()):
+            bright, dark = (one, OFF) if mode == Mode.BRIGHT_FIELD else (OFF, one)
+            images.append(renderer.render(solution.tilt, DARK_FIELD_TILT, bright, dark,
                                           frame=4 * mode + i))
         own = lights[4 * mode:4 * mode + 4]
         result = reconstruct(Stack(images, own, renderer.camera), outputs={'normal', 'shape'})
         error = angular_error_deg(result.normal, truth)
         name = 'dark field' if mode else f'bright field, CR {CONVERGENCE_RADIUS * 1e3:.0f} mm'
-        bright = np.clip(images[0] * (230.0 / np.percentile(images[0], 99.8)), 0, 255)
+        lit = np.clip(images[0] * (230.0 / np.percentile(images[0], 99.8)), 0, 255)
         shown = {
-            'picture, light from E': (bright.astype(np.uint8), 'gray', None),
+            'picture, light from E': (lit.astype(np.uint8), 'gray', None),
             f'normals (x, y times {gain:g})': (normal_view(result.normal, gain), None, None),
             'shape': (result.shape, 'gray', None),
             f'error: mean {np.nanmean(error):.2f} deg': (

@@ -78,24 +78,39 @@ def test_third_stack_waits_for_a_place():
             assert not entered.wait(0.3)
         assert entered.wait(2.0)
     thread.join()
-    assert pipeline.places_taken == 0
+    assert pipeline.on_their_way == 0
 
 
 def test_cancelled_stack_keeps_its_place_until_it_is_reconstructed():
     pipeline = StackPipeline(1)
-    pipeline.acquired('a')
-    with pytest.raises(PsError), pipeline.place(never):
+    with pytest.raises(PsError), pipeline.place(never) as taken:      # noqa: PT012
+        taken('a')
         pipeline.wait('a', 60.0, always, always)
-    assert pipeline.places_taken == 1
+    assert pipeline.on_their_way == 1
     assert code_of(lambda: pipeline.place(always).__enter__()) == ErrorCode.INSPECTION_CANCELLED
     pipeline.reconstructed(info('a'))
-    assert pipeline.places_taken == 0
+    assert pipeline.on_their_way == 0
 
 
-def test_place_of_a_cancelled_stack_is_not_lost_for_ever():
-    pipeline = StackPipeline(1)
+def test_captures_of_others_take_places_until_they_are_overtaken():
+    pipeline = StackPipeline(2)
+    for stack_id in ('probe 1', 'probe 2', 'probe 3'):
+        pipeline.acquired(stack_id)
+    assert code_of(lambda: pipeline.place(always).__enter__()) == ErrorCode.INSPECTION_CANCELLED
+    pipeline.reconstructed(info('probe 2'))
+    with pipeline.place(never) as taken:
+        taken('ours')
+    assert pipeline.on_their_way == 2
+    pipeline.forget('probe 3')       # its frames were refused
+    assert pipeline.on_their_way == 1
+
+
+def test_stack_that_nobody_will_reconstruct_gives_its_place_back():
+    pipeline = StackPipeline(1, patience=0.2)
     pipeline.acquired('a')
-    with pytest.raises(PsError), pipeline.place(never):
-        pipeline.wait('a', 0.1, always, always)
     with pipeline.place(never):
-        assert pipeline.places_taken == 1
+        assert pipeline.on_their_way == 1
+    pipeline.acquired('b')
+    assert code_of(lambda: pipeline.wait('b', 60.0, never, never)) == \
+        ErrorCode.INSPECTION_RECONSTRUCTION_LOST
+    assert pipeline.on_their_way == 0

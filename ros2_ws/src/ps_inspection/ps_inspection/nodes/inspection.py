@@ -58,7 +58,8 @@ class InspectionNode(Node):
         super().__init__('inspection')
         self.parameters = ros_support.Parameters(
             self, PARAMETERS, ErrorCode.INSPECTION_BAD_REQUEST)
-        self.pipeline = StackPipeline(self.parameters['pipeline_depth'])
+        self.pipeline = StackPipeline(self.parameters['pipeline_depth'],
+                                      self.parameters['reconstruction_timeout'])
         self.finished: deque[ps.Inspection] = deque(maxlen=self.parameters['remembered'])
         self.failures = 0
         self._session = ''
@@ -96,6 +97,8 @@ class InspectionNode(Node):
     def _on_acquired(self, message: ps.AcquisitionDone) -> None:
         if message.success:
             self.pipeline.acquired(message.stack_id)
+        else:
+            self.pipeline.forget(message.stack_id)     # its frames were refused afterwards
 
     def _on_session(self, message: String) -> None:
         self._session = message.data
@@ -124,7 +127,9 @@ class InspectionNode(Node):
         result = SearchIllumination.Result()
 
         def work() -> None:
-            with self._exclusive(), self._camera_of(goal):
+            # its probes are reconstructed, too: they must not push out an inspection's stack
+            with (self._exclusive(), self.pipeline.place(lambda: goal.is_cancel_requested),
+                  self._camera_of(goal)):
                 asked, roi = goal.request, goal.request.roi
                 search = self._prober.search(
                     Request(list(asked.modes), asked.cr_min, asked.cr_max, asked.probe_budget,
@@ -152,12 +157,13 @@ class InspectionNode(Node):
             stage = Inspect.Feedback
             with self._exclusive() as capture_over, self._outputs.wanted(goal.request.outputs):
                 _tell(goal, stage.WAITING)
-                with self.pipeline.place(lambda: goal.is_cancel_requested):
-                    with self._camera_of(goal):
-                        self._capture(goal, result, capture_over)
-                    capture_over()
-                    _tell(goal, stage.RECONSTRUCTING, True)
-                    self._reconstruct(goal, result)
+                with (self.pipeline.place(lambda: goal.is_cancel_requested) as taken,
+                      self._camera_of(goal)):
+                    self._capture(goal, result, capture_over)
+                    taken(result.stack_id)
+                capture_over()
+                _tell(goal, stage.RECONSTRUCTING, True)
+                self._reconstruct(goal, result)
                 self._deliver(goal, result)
 
         self._finish(goal, result, work)
@@ -248,7 +254,6 @@ class InspectionNode(Node):
         result.stack_id = self._source.capture(
             take, self.parameters['capture_timeout'], lambda: goal.is_cancel_requested,
             on_feedback).stack_id
-        self.pipeline.acquired(result.stack_id)
 
     def _reconstruct(self, goal: ServerGoalHandle, result: Inspect.Result) -> None:
         result.info = self.pipeline.wait(
@@ -305,7 +310,7 @@ class InspectionNode(Node):
 
     def _diagnose(self) -> ros_support.Report:
         values = {'inspections': len(self.finished), 'failures': self.failures,
-                  'on their way': self.pipeline.places_taken, 'dropped': self.pipeline.dropped,
+                  'on their way': self.pipeline.on_their_way, 'dropped': self.pipeline.dropped,
                   'exposing': self._exposing.locked()}
         if self.finished and not self.finished[-1].success:
             return ros_support.WARN, self.finished[-1].message, values

@@ -53,9 +53,6 @@ class Rights:
 # Needed only at times, so that a look at the graph may miss them: (node, right, name).
 ON_DEMAND = (
     ('ring_calibration', 'subscribe', 'stack'),                  # while it calibrates
-    ('inspection', 'subscribe', 'stack'),                        # while it searches
-    *(('inspection', 'subscribe', f'{output}/image') for output in (      # asked for as files
-        'albedo', 'confidence', 'curvature', 'height', 'normal', 'shape', 'slope')),
     ('camera_sequencer', 'subscribe', 'camera/image_raw'),       # with camera:=topic
     ('camera_sequencer', 'subscribe', 'camera/camera_info'),
     ('inspection', 'subscribe', 'stack'),                        # while it searches

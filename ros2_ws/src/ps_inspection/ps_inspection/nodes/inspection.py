@@ -33,9 +33,10 @@ from ps_reconstruction.result_files import write_quantities
 
 PARAMETERS = [
     Parameter('output_folder', '', 'Files of inspections are in it, a folder for each stack; '
-              'empty: the environment variable PS_OUTPUT_FOLDER, else ~/ps_inspections'),
+              'empty: the environment variable PS_OUTPUT_FOLDER, else ~/ps_inspections',
+              read_only=True),
     Parameter('session_folder', '', 'As of session_recorder: where the sessions named in results '
-              'are'),
+              'are', read_only=True),
     Parameter('capture_timeout', 60.0, 'Longest capture, moves included', 's', 1.0, 600.0),
     Parameter('reconstruction_timeout', 60.0, 'Longest wait for the reconstruction of a stack, '
               'those before it included', 's', 1.0, 600.0),

@@ -1,4 +1,4 @@
-"""From strobe to slope image, as real processes over DDS with fake hardware, split by stage."""
+"""From strobe to images, as real processes over DDS with fake hardware, split by stage."""
 from pathlib import Path
 import statistics
 import tempfile
@@ -11,12 +11,13 @@ from ps_head_driver.camera_model import scaled_camera
 from ps_head_driver.head_model import load_head, nominal_head_path
 from ps_inspection.cell_client import CellClient
 from ps_inspection.runner import Cell
+from ps_reconstruction.conversions import IMAGE_TOPICS
 
 SIZES = ((1280, 1024), (2448, 2048))     # pixels, mono8
 CAPTURES = 7
 
 
-def measure(width_px: int, height_px: int) -> dict[str, float]:
+def measure(width_px: int, height_px: int, outputs: list[str]) -> dict[str, float]:
     """Medians in seconds over CAPTURES stacks, after one to warm up."""
     rows: list[dict[str, float]] = []
     with tempfile.TemporaryDirectory() as name:
@@ -28,7 +29,7 @@ def measure(width_px: int, height_px: int) -> dict[str, float]:
             head.model_copy(update={'camera': camera}).model_dump(mode='json')))
         arguments = {'fake_hardware': 'true', 'camera': 'fake', 'scene': 'disc',
                      'head_file': str(head_file), 'session_folder': str(folder)}
-        with Cell(arguments, log_folder=folder / 'logs'), CellClient(outputs=['slope']) as client:
+        with Cell(arguments, log_folder=folder / 'logs'), CellClient(outputs=outputs) as client:
             client.home()
             client.illuminate(0.06)
             for _ in range(CAPTURES + 1):
@@ -36,23 +37,26 @@ def measure(width_px: int, height_px: int) -> dict[str, float]:
                 message = client.stack(stack_id)
                 info, _ = client.reconstruction(stack_id)
                 stamp = (info.header.stamp.sec, info.header.stamp.nanosec)
-                slope = client.images['slope'][stamp][1]
+                last = max(images[stamp][1] for images in client.images.values())
                 times = [light.device_time_ns for light in message.lights]
                 rows.append({
                     'first strobe to end of last exposure (board clock)':
                         (times[-1] - times[0]) * 1e-9 + message.lights[-1].exposure_time,
-                    'stack received to slope received': slope - client.stacks[stack_id][1],
+                    'stack received to last image received':
+                        last - client.stacks[stack_id][1],
                     **{f'  {d.stage}': d.duration for d in info.durations}})
     return {stage: statistics.median(row[stage] for row in rows[1:]) for stage in rows[-1]}
 
 
 def main() -> None:
     """Print one table; rendering is not part of it."""
-    results = [measure(*size) for size in SIZES]
-    names = [f'{width} x {height}' for width, height in SIZES]
-    table = Table('stage, ms', *names, title=f'strobe to slope image, median of {CAPTURES}')
-    for stage in results[0]:
-        table.add_row(stage, *(f'{result[stage] * 1e3:.1f}' for result in results))
+    cases = {'slope': ['slope'], 'all images': list(IMAGE_TOPICS)}
+    results = {f'{size[0]} x {size[1]}, {name}': measure(*size, outputs)
+               for size in SIZES for name, outputs in cases.items()}
+    table = Table('stage, ms', *results, title=f'strobe to image, median of {CAPTURES}')
+    for stage in dict.fromkeys(stage for result in results.values() for stage in result):
+        table.add_row(stage, *(f'{result[stage] * 1e3:.1f}' if stage in result else ''
+                               for result in results.values()))
     Console().print(table)
 
 

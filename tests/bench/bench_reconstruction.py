@@ -159,14 +159,14 @@ def offset_table() -> Table:
     table = Table('stands off by, mm', 'plate, degrees', 'plate tilted 6 degrees: lights on the '
                   'plane', 'after 2 rounds')
     head = load_head(nominal_head_path())
-    camera = scaled_camera(head.camera, 640, 512)
+    camera = scaled_camera(head.camera, 320, 256)
     lights = lights_at(head, MOTOR_COUNTS, 1.3)[:4]
 
     def plane_picture(normal: NDArray, offset: float) -> Stack:
-        base = Stack([np.zeros((512, 640), np.float32)], lights[:1], camera)
+        base = Stack([np.zeros((256, 320), np.float32)], lights[:1], camera)
         rays = stack_rays(base)
         nodes = surface_points(rays, Plane((normal[0], normal[1], normal[2]), offset))
-        points = expand(nodes, rays.step, (512, 640))
+        points = expand(nodes, rays.step, (256, 320))
         frames = [light_vectors(light, points) @ normal for light in lights]
         return Stack([(f / max(a.max() for a in frames)).astype(np.float32) for f in frames],
                      lights, camera)

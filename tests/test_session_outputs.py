@@ -102,6 +102,12 @@ def test_names_in_a_session_cannot_leave_the_folder(tmp_path: Path) -> None:
 
 # ---------------------------------------------------------------------------- reconstruct
 
+def test_empty_gain_maps_are_named() -> None:
+    stack = replace(rendered(scale=SMALL), gain_maps=[np.zeros((0, 4), np.float32)] * 4)
+    with pytest.raises(PsError, match='gain_maps'):
+        reconstruct(stack)
+
+
 def test_bad_stacks_are_reported_and_skipped(tmp_path: Path) -> None:
     good = numbered(2)
     dark = replace(good[0], stack_id='one light', images=good[0].images[:1],

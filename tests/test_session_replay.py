@@ -18,11 +18,12 @@ from sessions import rendered
 from ps_head_driver.conversions import message_to_image, stack_to_message
 from ps_head_driver.frames import optical_to_plane
 from ps_head_driver.ros_support import RELIABLE
-from ps_inspection.cell_client import OUTPUT_TOPICS, CellClient
+from ps_inspection.cell_client import CellClient
 from ps_inspection.graph import NODES
 from ps_inspection.runner import Cell
 from ps_interfaces import srv
 from ps_interfaces.msg import PhotometricStack
+from ps_reconstruction.conversions import IMAGE_TOPICS
 
 pytestmark = pytest.mark.graph
 OWN = [node for node in NODES if node.executable in ('reconstruction', 'session_recorder')]
@@ -46,7 +47,7 @@ def client(tmp_path_factory: pytest.TempPathFactory, ros_domain: int) -> Iterato
     arguments = {'session_folder': str(folder / 'sessions'),
                  'params_file': str(folder / 'parameters.yaml')}
     with Cell(arguments, nodes=OWN, log_folder=folder / 'logs'), \
-            CellClient('ps_head', OUTPUT_TOPICS) as client:
+            CellClient('ps_head', IMAGE_TOPICS) as client:
         client.wait_for_outputs()
         yield client
 
@@ -93,7 +94,7 @@ def test_live_and_offline_are_the_same_to_the_bit(
         info, _ = client.info[row['stack_id']]
         stamp = (info.header.stamp.sec, info.header.stamp.nanosec)
         offline = np.load(tmp_path / 'out' / row['folder'] / 'result.npz')
-        for name in set(OUTPUT_TOPICS) - {'preview'}:
+        for name in set(IMAGE_TOPICS) - {'preview'}:
             own = live[name][stamp]
             if name == 'normal':
                 own = optical_to_plane(own)

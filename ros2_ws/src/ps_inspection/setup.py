@@ -17,6 +17,7 @@ setup(
         ('share/' + package_name + '/launch', glob('launch/*.launch.py')),
     ],
     install_requires=['setuptools'],
+    extras_require={'cluster': ['distributed']},     # ps_session reconstruct --scheduler
     zip_safe=True,
     maintainer='ps_head maintainers',
     maintainer_email='maintainers@ps-head.invalid',

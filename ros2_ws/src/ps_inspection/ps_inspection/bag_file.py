@@ -25,7 +25,7 @@ class BagFile:
     """Appends messages; ``flush`` makes them survive the process, ``finish`` completes the bag.
 
     Until ``finish`` there is no metadata.yaml and the file has no index: readers of finished bags
-    refuse it, session_reader reads and repairs it.
+    refuse it, session_reader reads and session_recovery repairs it.
 
     :param path: the .mcap file; it must not exist, its folder must.
     :param topics: all topics, so that the file's first bytes describe whatever follows.

@@ -232,7 +232,7 @@ def _flat_at_nodes(stack: Stack, step: int) -> NDArray[np.float64]:
     out = np.empty((gh, gw, len(stack.gain_maps)))
     for t, gain in enumerate(stack.gain_maps):
         gain = np.asarray(gain, np.float32)
-        if gain.ndim != 2 or not np.isfinite(gain).all() or gain.max() <= 0:
+        if gain.ndim != 2 or not gain.size or not np.isfinite(gain).all() or gain.max() <= 0:
             raise PsError(BAD, f'gain_maps[{t}]: not a positive single-channel picture')
         ratio = np.array(gain.shape) / stack.shape
         # dust and noise of the board must not be divided into the part

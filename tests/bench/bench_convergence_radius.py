@@ -46,7 +46,8 @@ def main() -> None:
     for heads_name, heads in (('nominal', [nominal] * HEADS), ('random', random)):
         solvers = [CrSolver(head) for head in heads]
         for solver in solvers:
-            _ = solver.sampled
+            with suppress(PsError):
+                solver.inverse(WANTED)
         for what, action, arguments in (
                 ('inverse, from the head file', lambda head: inverse(head, WANTED), heads),
                 ('inverse, same head again', lambda solver: solver.inverse(WANTED), solvers),

@@ -34,7 +34,7 @@ class ConvergenceRadius(Node):
 
     def _use(self, head: HeadModel) -> None:
         solver = CrSolver(head)
-        _ = solver.sampled      # the slow part, and the compiler's, before the first request
+        solver.reachable(Branch.ANY)      # the slow part, and the compiler's, before any request
         self.head = head
         self._solvers = {0.0: solver}
 

@@ -46,7 +46,7 @@ OTHERS = {'/tf', '/tf_static', '/ps_head/robot_description', '/rosout', '/parame
 def cell(ros_domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
     folder = tmp_path_factory.mktemp('cell')
     with Cell({'fake_hardware': 'true', 'session_folder': str(folder / 'sessions')},
-              log_folder=folder / 'logs') as running:
+              log_folder=folder / 'logs', ready_timeout=180.0) as running:
         yield running
         running.check()
 

@@ -139,12 +139,20 @@ def _evaluate(m, motor):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True)
+def _branches_at(m, motor):  # type: ignore[no-untyped-def]
+    """Branches alone, (n,): near a crossing circles take long to fit."""
+    loop, ring, radial, plane_z = motor
+    center, axis = axes(tilts(m, loop), *ring)
+    return _branches(_intersections(center, axis, radial, plane_z)[1])
+
+
+@nb.njit(cache=True)
 def _narrowed(below, above, side, motor):  # type: ignore[no-untyped-def]
     """Close in on the end of a branch between two counts; all positions tried, (n,)."""
     tried = np.empty(0)
     while above - below > 1:
         tries = np.round(np.linspace(below, above, _TRIES))
-        branch = _evaluate(tries, motor)[1]
+        branch = _branches_at(tries, motor)
         last = 0
         while branch[last + 1] == side:
             last += 1
@@ -247,7 +255,7 @@ class CrSolver:
         """Motor positions (ascending whole counts), CR and branch there, branch ends included."""
         low, high = self._motor.limits_counts
         m = np.unique(np.linspace(low, high, _SAMPLES).round())
-        branch = _evaluate(m, self._compiled)[1]
+        branch = _branches_at(m, self._compiled)
         ends = [_narrowed(m[i], m[i + 1], branch[i], self._compiled)
                 for i in np.flatnonzero(branch[:-1] != branch[1:])]
         m = np.unique(np.concatenate([m, *ends]))

@@ -1,109 +1,164 @@
-"""Ring calibration: accuracy over random heads and repeatability, against what is wanted.
+"""Ring calibration over random heads, against what the project wants of it.
 
-Run with: python tests/bench/bench_calibration.py --heads 50 --scale 0.5
+Run with: python -m tests.bench calibration, or all heads in parts that add up in a file:
+python tests/bench/bench_calibration.py --heads 50 --scale 1 --results heads.jsonl
 """
 import argparse
+from collections.abc import Callable
+import json
 import math
+from pathlib import Path
 import time
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
 
-from ps_calibration.calibrate import calibrate
+from ps_calibration.before_after import outcome, relit
+from ps_calibration.calibrate import calibrate, head_calibration
 from ps_calibration.ring_fit import corrected
 from ps_calibration.ring_target import RingTarget, default_target_path, load_target
-from ps_calibration.synthetic import errors_of, random_bench, render_stack, solid_of
+from ps_calibration.synthetic import (
+    Bench,
+    errors_of,
+    random_bench,
+    render_part,
+    render_stack,
+    solid_of,
+)
 from ps_head_driver.head_model import HeadModel, load_head, nominal_head_path
 from ps_head_driver.kinematics import BrightFieldKinematics
-from ps_head_driver.stack import Plane
+from ps_head_driver.stack import Plane, Truth
+
+# name in the results, row of the table, unit, what is wanted
+_ROWS = (('direction', 'light direction', 'deg', 'median 0.05, worst 0.15'),
+         ('intensity', 'relative intensity', '%', '0.3'),
+         ('level', 'plane level', 'deg', '0.03'),
+         ('plate', 'flat plate, normal bias', 'deg', '0.15'),
+         ('boss', 'height of the 1 mm boss', '%', '0.5'),
+         ('z_scale', 'z scale', '%', ''),
+         ('seconds', 'time', 's', '10'))
 
 
-def accuracy(nominal: HeadModel, target: RingTarget, seeds: range, scale: float,
-             tilt: float) -> None:
-    """Print the errors over random heads, before and after the calibration."""
-    counts = BrightFieldKinematics(nominal).motor_counts(tilt)
-    found, before, z_scales, seconds = [], [], [], []
-    for seed in seeds:
-        bench = random_bench(nominal, seed)
-        stack = render_stack(bench, nominal, solid_of(target), counts, scale, seed)
-        start = time.perf_counter()
-        result = calibrate([stack], target, nominal)
-        seconds.append(time.perf_counter() - start)
-        print(f'head {seed}: {result.verdict} {result.reason}', flush=True)
-        if result.fit is None:
-            continue
-        before.append(errors_of(nominal, Plane(), bench, tilt))
-        found.append(errors_of(corrected(nominal, result.fit.panels), result.fit.pose.plane,
-                               bench, tilt))
-        z_scales.append(abs(result.z_scale - 1))
-    print(f'{"":28}{"median":>10}{"worst":>10}{"before":>10}   target')
-
-    def row(name: str, values: Any, first: Any, wanted: str) -> None:
-        was = f'{np.max(first):10.3f}' if first is not None else f'{"":10}'
-        print(f'{name:28}{np.median(values):10.4f}{np.max(values):10.4f}{was}   {wanted}')
-
-    row('light direction, deg', [e.direction_deg for e in found],
-        [e.direction_deg for e in before], 'median 0.05, worst 0.15')
-    row('relative intensity, %', [100 * abs(e.intensity) for e in found],
-        [100 * abs(e.intensity) for e in before], '0.3')
-    row('plane level, deg', [e.level_deg for e in found], [e.level_deg for e in before], '0.03')
-    row('z scale, %', 100 * np.array(z_scales), None, '')
-    row('time, s', seconds, None, '10')
-
-
-def positions(nominal: HeadModel, target: RingTarget, scale: float) -> None:
-    """Print what two motor positions, fitted together, find for the second one's tilt."""
-    kinematics, bench = BrightFieldKinematics(nominal), random_bench(nominal, 3)
-    counts = [kinematics.motor_counts(math.radians(degrees)) for degrees in (20, 30)]
+def one_head(nominal: HeadModel, target: RingTarget, seed: int, scale: float, counts: int,
+             with_parts: bool) -> dict[str, Any]:
+    """Errors of one head before and after, as numbers by the names of the table's rows."""
+    bench = random_bench(nominal, seed)
+    tilt = float(BrightFieldKinematics(nominal).tilt(counts))
+    stack = render_stack(bench, nominal, solid_of(target), counts, scale, seed)
     start = time.perf_counter()
-    result = calibrate([render_stack(bench, nominal, solid_of(target), m, scale) for m in counts],
-                       target, nominal)
-    seconds = time.perf_counter() - start
-    print(f'two positions: {result.verdict} {result.reason}')
-    if result.fit is not None:
-        error = result.fit.tilts[1] - float(kinematics.tilt(counts[1]))
-        print(f'tilt of the second against the first: {math.degrees(error):.4f} deg off, '
-              f'{seconds:.1f} s with rendering')
+    result = calibrate([stack], target, nominal)
+    found: dict[str, Any] = {'seed': seed, 'scale': scale, 'verdict': result.verdict,
+                             'reason': result.reason, 'seconds': time.perf_counter() - start}
+    if result.fit is None:
+        return found
+    after = errors_of(corrected(nominal, result.fit.panels), result.fit.pose.plane, bench, tilt)
+    before = errors_of(nominal, Plane(), bench, tilt)
+    for name, errors in (('before', before), ('after', after)):
+        found[name] = {'direction': float(errors.direction_deg.max()),
+                       'intensity': 100 * float(abs(errors.intensity).max()),
+                       'level': errors.level_deg}
+    found['after']['z_scale'] = 100 * abs(result.z_scale - 1)
+    if with_parts:
+        calibration = head_calibration(result, nominal, target)
+        blank = render_stack(bench, nominal, solid_of(target, height=0.0,
+                                                      dots=np.empty((0, 2))), counts, scale, seed)
+        normal = bench.where.rotation[:, 2].astype(np.float32)
+        flat = Truth(normal=np.broadcast_to(normal, (*blank.shape, 3)).copy())
+        boss, truth = render_part(bench, nominal, 'boss', counts, scale, seed)
+        # the boss lies on the nominal plane
+        level = calibration.model_copy(update={'plane_normal': (0, 0, 1), 'plane_offset': 0})
+        for name, plate, lights in (('before', None, None), ('after', calibration, level)):
+            found[name]['plate'] = outcome(relit(blank, nominal, plate), flat).bias_deg
+            found[name]['boss'] = 100 * abs(
+                outcome(relit(boss, nominal, lights), truth).height_scale - 1)
+    return found
+
+
+def results(path: Path | None, seeds: range, scale: float,
+            measure: Callable[[int], dict[str, Any]]) -> list[dict[str, Any]]:
+    """Results of all heads; those that a file already holds are not measured again."""
+    known = {}
+    if path and path.is_file():
+        known = {(entry['seed'], entry['scale']): entry
+                 for entry in map(json.loads, path.read_text().splitlines())}
+    for seed in seeds:
+        if (seed, scale) not in known:
+            known[seed, scale] = measure(seed)
+            if path:
+                with path.open('a') as file:
+                    file.write(json.dumps(known[seed, scale]) + '\n')
+    return [known[seed, scale] for seed in seeds]
+
+
+def table(found: list[dict[str, Any]], scale: float) -> Table:
+    """One row per target of the project."""
+    verdicts = [entry['verdict'] for entry in found]
+    made = Table(title=f'{len(found)} heads at scale {scale:g}: '
+                       + ', '.join(f'{verdicts.count(v)} {v}' for v in sorted(set(verdicts))))
+    for column in ('', 'heads', 'before, worst', 'median', '95 %', 'worst', 'wanted'):
+        made.add_column(column, justify='left' if column in ('', 'wanted') else 'right')
+    for name, row, unit, wanted in _ROWS:
+        first, last = ([value for entry in found if 'after' in entry for value in [
+            entry['seconds'] if name == 'seconds' else entry[when].get(name)]
+            if value is not None] for when in ('before', 'after'))
+        if last:
+            was = f'{max(first):.3g}' if first and name != 'seconds' else ''
+            made.add_row(f'{row}, {unit}', str(len(last)), was, *(
+                f'{np.quantile(last, part):.3g}' for part in (0.5, 0.95, 1)), wanted)
+    return made
 
 
 def repeatability(nominal: HeadModel, target: RingTarget, repeats: int, scale: float,
-                  tilt: float) -> None:
-    """Print the scatter of the light directions over pictures that differ by their noise."""
-    counts = BrightFieldKinematics(nominal).motor_counts(tilt)
-    bench = random_bench(nominal, 3)
-    directions = []
+                  counts: int) -> str:
+    """Scatter of the light directions over pictures that differ by their noise."""
+    bench, tilt = random_bench(nominal, 3), float(BrightFieldKinematics(nominal).tilt(counts))
+    directions: list[NDArray] = []
     for seed in range(repeats):
         stack = render_stack(bench, nominal, solid_of(target), counts, scale, 100 + seed)
         fit = calibrate([stack], target, nominal).fit
         if fit is not None:
-            directions.append(errors_of(corrected(nominal, fit.panels), fit.pose.plane, bench,
-                                        tilt).direction_deg)
-    print(f'repeatability over {len(directions)}, deg '
-          f'{np.std(directions, axis=0, ddof=1).max():.4f}   target 0.01')
+            directions.append(light_vectors_of(corrected(nominal, fit.panels), bench, tilt))
+    spread = np.std(directions, axis=0, ddof=1)              # (4, 3)
+    worst = math.degrees(np.linalg.norm(spread, axis=1).max())
+    return f'light directions repeat over {len(directions)} to {worst:.4f} deg, wanted 0.01'
+
+
+def light_vectors_of(head: HeadModel, bench: Bench, tilt: float) -> NDArray:
+    """Unit vectors towards the lights at the middle of the true plane, (4, 3)."""
+    from ps_calibration.target_pose import TargetPose
+    from ps_calibration.uncertainty import light_directions
+    turn = bench.where.rotation
+    flat = np.array([*bench.where.position, 0, math.asin(-turn[1, 2]), math.asin(turn[0, 2])])
+    return light_directions(head, TargetPose(flat), bench.head.camera, tilt)
 
 
 def main() -> None:
-    """Print the tables."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument('--only',
-                        choices=('accuracy', 'positions', 'repeatability'))
-    parser.add_argument('--heads', type=int, default=10)
+    parser.add_argument('--heads', type=int, default=5)
     parser.add_argument('--first', type=int, default=1, help='seed of the first head')
+    parser.add_argument('--parts', type=int, default=2, help='heads to reconstruct parts with')
+    parser.add_argument('--repeats', type=int, default=0, help='of noise, on one head; 10 is '
+                        'what the project asks for')
     parser.add_argument('--scale', type=float, default=0.5, help='of the pictures')
     parser.add_argument('--tilt-deg', type=float, default=30.0)
+    parser.add_argument('--results', type=Path, metavar='JSONL',
+                        help='file of results: heads in it are not done again')
     arguments, _ = parser.parse_known_args()       # tests.bench passes the names of benches
     nominal, target = load_head(nominal_head_path()), load_target(default_target_path())
-    scale, tilt = arguments.scale, math.radians(arguments.tilt_deg)
-    # the tilt that the motor reaches, rounded to a count
-    tilt = float(BrightFieldKinematics(nominal).tilt(
-        BrightFieldKinematics(nominal).motor_counts(tilt)))
-    if arguments.only in (None, 'accuracy'):
-        seeds = range(arguments.first, arguments.first + arguments.heads)
-        accuracy(nominal, target, seeds, scale, tilt)
-    if arguments.only in (None, 'positions'):
-        positions(nominal, target, scale)
-    if arguments.only in (None, 'repeatability'):
-        repeatability(nominal, target, 10, scale, tilt)
+    counts = BrightFieldKinematics(nominal).motor_counts(math.radians(arguments.tilt_deg))
+    scale, first = arguments.scale, arguments.first
+    found = results(
+        arguments.results, range(first, first + arguments.heads), scale,
+        lambda seed: one_head(nominal, target, seed, scale, counts,
+                              seed < first + arguments.parts))
+    console = Console(width=110)
+    console.print(table(found, scale))
+    if arguments.repeats:
+        console.print(repeatability(nominal, target, arguments.repeats, scale, counts))
 
 
 if __name__ == '__main__':

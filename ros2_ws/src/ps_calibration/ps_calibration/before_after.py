@@ -104,7 +104,7 @@ def compare(name: str, stack: Stack, truth: Truth | None, head: HeadModel,
     if stack.camera is None:
         raise PsError(ErrorCode.CALIBRATION_BAD_REQUEST,
                       f'{name}: the pictures have no camera (lights.yaml)')
-    before, after = ({method: _outcome(relit(stack, head, used), truth, method)
+    before, after = ({method: outcome(relit(stack, head, used), truth, method)
                       for method in ('ls', 'stv')} for used in (None, calibration))
     known = None
     if truth is not None and truth.height is not None:
@@ -113,7 +113,12 @@ def compare(name: str, stack: Stack, truth: Truth | None, head: HeadModel,
                       known)
 
 
-def _outcome(stack: Stack, truth: Truth | None, method: str) -> Outcome:
+def outcome(stack: Stack, truth: Truth | None, method: str = 'ls') -> Outcome:
+    """Reconstruct a part by one method and compare it with the truth, if that is known.
+
+    :param stack: as from relit.
+    :param method: 'ls' or 'stv'.
+    """
     made = reconstruct(stack, Options(method=method), {'normal', 'height'})
     assert made.height is not None
     known = truth.height if truth is not None and truth.height is not None else 0.0

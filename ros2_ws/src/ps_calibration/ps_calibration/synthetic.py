@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from ps_calibration.ring_fit import corrected
 from ps_calibration.ring_target import RingTarget
 from ps_head_driver.camera_model import plane_points
-from ps_head_driver.fake.renderer import Sensor
+from ps_head_driver.fake.renderer import Sensor, make_renderer
 from ps_head_driver.fake.ring_renderer import Placement, RingRenderer, RingSolid, placement
 from ps_head_driver.head_model import DIRECTIONS, HeadModel
 from ps_head_driver.kinematics import BrightFieldKinematics, as_light, lights_at
 from ps_head_driver.light_model import light_vectors
-from ps_head_driver.stack import Light, Panel, Plane, Stack, angular_error_deg
+from ps_head_driver.stack import Light, Panel, Plane, Stack, Truth, angular_error_deg
 
 _LENS = (-0.05, 0.0, 0.0, 0.0, 0.0)     # a pixel or so in the corners of the picture
 
@@ -69,6 +69,20 @@ def render_stack(bench: Bench, nominal: HeadModel, solid: RingSolid, m_counts: i
               Light(panel=Panel.ALL, motor_counts=m_counts, exposure_scale=0.25, name='ALL'),
               Light(panel=Panel.NONE, motor_counts=m_counts, name='NONE')]
     return Stack(images=renderer.capture(tilt, 0.8), lights=lights, camera=renderer.camera)
+
+
+def render_part(bench: Bench, nominal: HeadModel, scene: str, m_counts: int,
+                scale: float = 1.0, seed: int = 1) -> tuple[Stack, Truth]:
+    """Pictures of a part under E, N, W, S, labelled with the nominal lights, and its truth.
+
+    :param scene: see fake.scenes; its ground is the nominal plane.
+    """
+    renderer = make_renderer(scene, bench.head, Sensor(vignetting=0.1), scale, seed)
+    tilt = float(BrightFieldKinematics(nominal).tilt(m_counts))
+    images = [renderer.render(tilt, 0.0, list(levels), exposure=0.8 * renderer.sensor.exposure,
+                              frame=i) for i, levels in enumerate(np.eye(4))]
+    lights = lights_at(nominal, m_counts, nominal.dark_field.tilt_range[0])[:4]
+    return Stack(images=images, lights=lights, camera=renderer.camera), renderer.truth()
 
 
 def with_images(stack: Stack, images: list[NDArray]) -> Stack:

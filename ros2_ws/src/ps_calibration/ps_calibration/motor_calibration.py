@@ -13,12 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from ps_calibration.calibrate import Calibration
+from ps_head_driver.calibration_file import MotorCorrection
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import HeadModel
 from ps_head_driver.kinematics import BrightFieldKinematics
+from ps_head_driver.stack import Panel, Stack
 
 # what is plausible: offset (counts), scale, phase of the crank (rad), backlash (counts)
 _PRIOR = np.array([2000.0, 0.02, 0.05, 2000.0])
+_POSITIONS = 3                  # different ones, at least
+Approach = Literal['up', 'down']
 _TILT_NOISE = 1e-4              # rad, of a tilt from a ring calibration
 
 
@@ -33,7 +38,7 @@ class TiltReading:
 
     motor_counts: int
     tilt: float
-    approach: Literal['up', 'down'] = 'up'
+    approach: Approach = 'up'
 
 
 @dataclass(frozen=True)
@@ -54,9 +59,11 @@ class MotorCalibration:
     backlash_counts: float
     repeatability_counts: float
 
-    def corrected(self, head: HeadModel) -> HeadModel:
-        """The head with these kinematics, for positions approached from below (up)."""
-        return _moved(head, self.offset_counts, self.scale - 1, self.crank_offset)
+    @property
+    def correction(self) -> MotorCorrection:
+        """What the calibration file keeps of it."""
+        return MotorCorrection(offset_counts=self.offset_counts, scale=self.scale,
+                               crank_offset=self.crank_offset)
 
     def counts_for(self, head: HeadModel, tilt: float, approach: str = 'up') -> int:
         """Motor counts to command for a tilt (rad) when arriving from one side.
@@ -64,7 +71,7 @@ class MotorCalibration:
         :param head: as it was before the correction.
         :raises PsError: HEAD_OUT_OF_LIMITS.
         """
-        counts = float(BrightFieldKinematics(self.corrected(head)).motor_position(tilt))
+        counts = float(_kinematics(head, self.correction).motor_position(tilt))
         play = self.backlash_counts if approach == 'down' and np.isfinite(
             self.backlash_counts) else 0.0
         return round(counts - play)
@@ -81,15 +88,21 @@ def calibrate_motor(readings: Sequence[TiltReading], head: HeadModel) -> MotorCa
     counts = np.array([reading.motor_counts for reading in readings], np.float64)
     tilts = np.array([reading.tilt for reading in readings])
     down = np.array([reading.approach == 'down' for reading in readings])
-    if len(np.unique(counts)) < 3:
+    if len(np.unique(counts)) < _POSITIONS:
         raise PsError(code, 'the motor needs pictures at three or more motor positions, '
                             f'{len(np.unique(counts))} given')
     if not np.isfinite(tilts).all():
         raise PsError(code, 'tilt: not all numbers are finite')
     both = down.any() and not down.all()
+    # with one direction alone the correction holds for that one
+    down &= both
+
+    def moved(x: NDArray) -> BrightFieldKinematics:
+        return _kinematics(head, MotorCorrection(offset_counts=x[0], scale=1 + x[1],
+                                                 crank_offset=x[2]))
 
     def predicted(x: NDArray) -> NDArray:
-        kinematics = BrightFieldKinematics(_moved(head, *x[:3]))
+        kinematics = moved(x)
         low, high = kinematics.limits_counts
         wanted = counts + x[3] * down
         # beyond the soft limits the tilt goes on as at the limit, in a straight line
@@ -101,7 +114,7 @@ def calibrate_motor(readings: Sequence[TiltReading], head: HeadModel) -> MotorCa
         return np.concatenate([(predicted(x) - tilts) / _TILT_NOISE, x / _PRIOR])
 
     fit = least_squares(residuals, np.zeros(4), x_scale=[100.0, 1e-3, 1e-3, 100.0])
-    kinematics = BrightFieldKinematics(_moved(head, *fit.x[:3]))
+    kinematics = moved(fit.x)
     left = (predicted(fit.x) - tilts) / abs(kinematics.dtilt_dm(
         np.clip(counts, *kinematics.limits_counts)))
     freedom = max(len(counts) - 3 - both, 1)
@@ -110,13 +123,25 @@ def calibrate_motor(readings: Sequence[TiltReading], head: HeadModel) -> MotorCa
                             float(np.sqrt(np.sum(left**2) / freedom)))
 
 
-def _moved(head: HeadModel, offset: float, scale_error: float, phase: float) -> HeadModel:
-    """Head whose slider stands ``offset`` counts further, and moves (1 + scale_error) as far."""
-    field, slider = head.bright_field, head.bright_field.slider
-    per_metre = slider.counts_per_metre / (1 + scale_error)
-    shifted = slider.model_copy(update={
-        'counts_per_metre': per_metre,
-        'z_at_m0': slider.z_at_m0 + slider.direction * offset / per_metre})
-    crank = field.crank.model_copy(update={'offset': field.crank.offset + phase})
-    return head.model_copy(update={'bright_field': field.model_copy(
-        update={'slider': shifted, 'crank': crank})})
+def motor_of(result: Calibration, stacks: Sequence[Stack], head: HeadModel,
+             approaches: Sequence[Approach] = ()) -> MotorCalibration | None:
+    """The motor's own calibration from a ring calibration at several positions.
+
+    :param stacks: that the result is from.
+    :param head: as designed.
+    :param approaches: last direction of motion of each; up if not given.
+    :returns: None with fewer than three positions, without counts or after a failure.
+    """
+    if result.fit is None or result.verdict == 'FAILED':
+        return None
+    counts = [next(light.motor_counts for light in stack.lights if light.panel == Panel.E)
+              for stack in stacks]
+    if len(set(counts)) < _POSITIONS:
+        return None
+    return calibrate_motor([TiltReading(*reading) for reading in zip(
+        counts, result.fit.tilts, approaches or ['up'] * len(counts), strict=True)], head)
+
+
+def _kinematics(head: HeadModel, correction: MotorCorrection) -> BrightFieldKinematics:
+    return BrightFieldKinematics(head.model_copy(
+        update={'bright_field': correction.corrected(head.bright_field)}))

@@ -80,9 +80,11 @@ def gather(result: Calibration, stacks: Sequence[Stack], names: Sequence[str], t
     if result.fit is None or result.verdict == 'FAILED':
         return Evidence(result, stacks, names, target, head, datetime.now(UTC), serial=serial)
     calibration = head_calibration(result, head, target, serial)
-    if motor is not None and motor.backlash_counts > 0:
-        calibration = calibration.model_copy(
-            update={'backlash_counts': round(motor.backlash_counts)})
+    if motor is not None:
+        known = motor.backlash_counts > 0
+        calibration = calibration.model_copy(update={
+            'motor': motor.correction,
+            'backlash_counts': round(motor.backlash_counts) if known else 0})
     repeated = [found for group in repeats(stacks)
                 if (found := repeatability(group, target, head)) is not None]
     return Evidence(result, stacks, names, target, head, calibration.created, calibration, motor,

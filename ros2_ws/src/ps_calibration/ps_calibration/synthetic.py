@@ -56,15 +56,17 @@ def random_bench(nominal: HeadModel, seed: int) -> Bench:
 
 
 def render_stack(bench: Bench, nominal: HeadModel, solid: RingSolid, m_counts: int,
-                 scale: float = 1.0, seed: int = 1) -> Stack:
+                 scale: float = 1.0, seed: int = 1, tilt: float | None = None) -> Stack:
     """The six pictures of one motor position, labelled with the nominal lights.
 
-    :param m_counts: at which the head really stands; tilt without error.
+    :param m_counts: of the encoder.
     :param scale: of the pictures.
+    :param tilt: that the panels really have, rad; None: that of the nominal crank.
     """
     sensor = Sensor(ambient=0.02, vignetting=0.1)
     renderer = RingRenderer(solid, bench.where, bench.head, sensor, scale, seed)
-    tilt = float(BrightFieldKinematics(nominal).tilt(m_counts))
+    if tilt is None:
+        tilt = float(BrightFieldKinematics(nominal).tilt(m_counts))
     lights = [*lights_at(nominal, m_counts, nominal.dark_field.tilt_range[0])[:4],
               Light(panel=Panel.ALL, motor_counts=m_counts, exposure_scale=0.25, name='ALL'),
               Light(panel=Panel.NONE, motor_counts=m_counts, name='NONE')]

@@ -19,6 +19,7 @@ import yaml
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import (
     DIRECTIONS,
+    BrightField,
     CameraGeometry,
     HeadModel,
     PanelTolerance,
@@ -27,7 +28,9 @@ from ps_head_driver.head_model import (
 )
 
 FORMAT = 'ps_head_calibration'
-VERSION = 1
+VERSION = 2
+# version 1 had no motor; its files are read as those of a motor as designed
+READABLE = (1, 2)
 
 Verdict = Literal['OK', 'POOR', 'FAILED']
 PanelName = Literal['BF_E', 'BF_N', 'BF_W', 'BF_S', 'DF_E', 'DF_N', 'DF_W', 'DF_S']
@@ -47,6 +50,29 @@ class PanelCorrection(_Section):
     shadow_residual_px: float | None = None
 
 
+class MotorCorrection(_Section):
+    """How the crank-slider as made differs from the nominal one.
+
+    Holds for positions that are approached as they were when it was measured (upwards, as
+    head_driver does by default).
+    """
+
+    offset_counts: float = 0.0                           # to add to the counts at m0_counts
+    scale: Annotated[float, Field(gt=0.5, lt=2)] = 1.0   # true travel of the slider over nominal
+    crank_offset: float = 0.0                            # to add to the crank's offset, rad
+
+    def corrected(self, field: BrightField) -> BrightField:
+        """The bright field with the crank-slider as made."""
+        slider = field.slider
+        per_metre = slider.counts_per_metre / self.scale
+        return field.model_copy(update={
+            'slider': slider.model_copy(update={
+                'counts_per_metre': per_metre, 'z_at_m0':
+                    slider.z_at_m0 + slider.direction * self.offset_counts / per_metre}),
+            'crank': field.crank.model_copy(
+                update={'offset': field.crank.offset + self.crank_offset})})
+
+
 class HeadCalibration(_Section):
     """Result of a ring calibration; units and frames as in ps_interfaces/HeadCalibration."""
 
@@ -58,6 +84,7 @@ class HeadCalibration(_Section):
     plane_offset: float = 0.0
     panels: dict[PanelName, PanelCorrection] = Field(default_factory=dict)
     backlash_counts: Annotated[int, Field(ge=0)] = 0
+    motor: MotorCorrection = MotorCorrection()
     z_scale: Annotated[float, Field(gt=0)] = 1.0
     verdict: Verdict
     verdict_reason: str = ''
@@ -73,7 +100,7 @@ class HeadCalibration(_Section):
 
 
 def apply(head: HeadModel, calibration: HeadCalibration | None) -> HeadModel:
-    """The head as calibrated: corrections added to its tolerances, camera and backlash replaced.
+    """The head as calibrated: panels and crank-slider corrected, camera and backlash replaced.
 
     :param calibration: None leaves the head as it is (nominal geometry).
     """
@@ -92,7 +119,7 @@ def apply(head: HeadModel, calibration: HeadCalibration | None) -> HeadModel:
                 'intensity': old.intensity * fix.intensity})
         return result
 
-    bright, dark = head.bright_field, head.dark_field
+    bright, dark = calibration.motor.corrected(head.bright_field), head.dark_field
     return head.model_copy(update={
         'camera': calibration.camera,
         'bright_field': bright.model_copy(update={'panels': corrected('BF', bright.panels)}),
@@ -150,10 +177,10 @@ def read_calibration(path: str | Path) -> HeadCalibration:
     if not isinstance(content, dict) or content.get('format') != FORMAT:
         raise PsError(invalid, f'{path}: not a calibration file (format: {FORMAT} is missing)')
     version = content.pop('version', None)
-    if version != VERSION:
+    if version not in READABLE:
         raise PsError(ErrorCode.CALIBRATION_FILE_VERSION,
                       f'{path}: version {version} cannot be read by this software (it reads '
-                      f'{VERSION}); calibrate again')
+                      f'{" and ".join(map(str, READABLE))}); calibrate again')
     stored = content.pop('hash', None)
     if stored != content_hash({**content, 'version': version}):
         raise PsError(invalid, f'{path}: hash does not match, the file was edited or damaged; '

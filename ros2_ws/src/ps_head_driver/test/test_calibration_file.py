@@ -7,14 +7,17 @@ import yaml
 
 from ps_head_driver.calibration_file import (
     HeadCalibration,
+    MotorCorrection,
     PanelCorrection,
     apply,
+    content_hash,
     new_calibration_id,
     read_calibration,
     write_calibration,
 )
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import load_head, nominal_head_path
+from ps_head_driver.kinematics import BrightFieldKinematics
 
 
 @pytest.fixture
@@ -26,7 +29,8 @@ def calibration():
         camera=head.camera, plane_normal=(0.01, 0.0, (1 - 1e-4) ** 0.5), plane_offset=2e-4,
         panels={'BF_E': PanelCorrection(shift=(1e-3, 0, -2e-3), tilt_offset=0.01, intensity=1.02),
                 'DF_S': PanelCorrection(twist=-0.02)},
-        backlash_counts=80, z_scale=1.001, verdict='OK', target_name='half-ring-24')
+        backlash_counts=80, motor=MotorCorrection(offset_counts=150.0, scale=1.002),
+        z_scale=1.001, verdict='OK', target_name='half-ring-24')
 
 
 def test_round_trip(tmp_path, calibration):
@@ -46,6 +50,9 @@ def test_corrections_reach_the_head(calibration):
     assert fixed.dark_field.panels['S'].twist == -0.02
     assert fixed.bright_field.panels['N'] == head.bright_field.panels['N']
     assert apply(head, None) is head
+    # counts mean what the corrected slider makes of them
+    found, nominal = (BrightFieldKinematics(each) for each in (fixed, head))
+    assert found.tilt(20000) == pytest.approx(nominal.tilt(20000 * 1.002 + 150 * 1.002))
 
 
 def refused(path, code):
@@ -77,6 +84,16 @@ def test_other_version_is_refused(tmp_path, calibration):
     content = yaml.safe_load(path.read_text())
     path.write_text(yaml.safe_dump({**content, 'version': 99}))
     assert 'version 99' in refused(path, ErrorCode.CALIBRATION_FILE_VERSION)
+
+
+def test_a_file_of_version_1_has_a_motor_as_designed(tmp_path, calibration):
+    path = tmp_path / 'cal.yaml'
+    write_calibration(calibration, path)
+    content = yaml.safe_load(path.read_text())
+    content = {key: value for key, value in content.items() if key not in ('motor', 'hash')}
+    content['version'] = 1
+    path.write_text(yaml.safe_dump({**content, 'hash': content_hash(content)}))
+    assert read_calibration(path) == calibration.model_copy(update={'motor': MotorCorrection()})
 
 
 @pytest.mark.parametrize('content', ['', 'hello: world', '[1, 2]', '!!python/object:os.system x'])

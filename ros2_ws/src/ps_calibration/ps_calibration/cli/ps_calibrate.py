@@ -11,13 +11,13 @@ import numpy as np
 from ps_calibration.before_after import Outcome, compare
 from ps_calibration.calibrate import Calibration, calibrate
 from ps_calibration.catalogue import list_calibrations
-from ps_calibration.motor_calibration import MotorCalibration, TiltReading, calibrate_motor
+from ps_calibration.motor_calibration import motor_of
 from ps_calibration.report import Evidence, gather, report, write_report
 from ps_calibration.ring_target import RingTarget, default_target_path, load_target
 from ps_head_driver.calibration_file import write_calibration
 from ps_head_driver.errors import PsError
 from ps_head_driver.head_model import DIRECTIONS, HeadModel, load_head, nominal_head_path
-from ps_head_driver.stack import Panel, Stack
+from ps_head_driver.stack import Stack
 from ps_head_driver.stack_folder import read_lights, read_stack
 
 
@@ -44,21 +44,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument('--serial', default='', help='serial number of the head, for the file')
     parser.add_argument('--json', type=Path, metavar='FILE', help='machine-readable result')
     return parser
-
-
-def motor_of(result: Calibration, head: HeadModel, folders: list[Path],
-             stacks: list[Stack]) -> MotorCalibration | None:
-    """The motor's own calibration; None with fewer than three positions or a failed fit."""
-    if result.fit is None or result.verdict == 'FAILED':
-        return None
-    readings = []
-    for folder, stack, tilt in zip(folders, stacks, result.fit.tilts, strict=True):
-        counts = next(light.motor_counts for light in stack.lights if light.panel == Panel.E)
-        approach = read_lights(folder).approach or 'up'
-        readings.append(TiltReading(counts, tilt, approach))
-    if len({reading.motor_counts for reading in readings}) < 3:
-        return None
-    return calibrate_motor(readings, head)
 
 
 def _numbers(values: dict[str, float]) -> dict[str, float | None]:
@@ -160,7 +145,8 @@ def main() -> None:
         head = load_head(arguments.head or nominal_head_path())
         target = load_target(arguments.target or default_target_path())
         stacks, result = calibrate_folders(arguments.folders, target, head)
-        motor = motor_of(result, head, arguments.folders, stacks)
+        motor = motor_of(result, stacks, head, [
+            read_lights(folder).approach or 'up' for folder in arguments.folders[:len(stacks)]])
         evidence = gather(result, stacks, [folder.name for folder in arguments.folders], target,
                           head, arguments.serial, motor)
         if evidence.calibration:

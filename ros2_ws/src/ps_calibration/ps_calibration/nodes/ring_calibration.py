@@ -13,6 +13,7 @@ from std_srvs.srv import Trigger
 
 from ps_calibration.calibrate import calibrate
 from ps_calibration.catalogue import list_calibrations
+from ps_calibration.motor_calibration import motor_of
 from ps_calibration.report import gather, report, write_report
 from ps_calibration.ring_pictures import common_camera
 from ps_calibration.ring_target import RingTarget, default_target_path, load_target
@@ -221,7 +222,8 @@ class RingCalibration(Node):
         self._feedback(goal, CalibrateRing.Feedback.REPORTING, done, len(radii))
         serial = self.parameters['head_serial'] or self.reported_serial
         evidence = self._in_worker(lambda: gather(
-            fitted, stacks, [f'position_{k + 1}' for k in range(done)], target, self.head, serial))
+            fitted, stacks, [f'position_{k + 1}' for k in range(done)], target, self.head, serial,
+            motor_of(fitted, stacks, self.head)))
         text = self._in_worker(lambda: report(evidence))
         # the name has the serial number in it, which came over the network
         path = self._path(f'{evidence.name}.yaml', 'serial number')

@@ -4,11 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from ps_calibration.calibrate import calibrate, head_calibration
-from ps_calibration.motor_calibration import TiltReading, calibrate_motor, motor_of
-from ps_calibration.ring_target import RingTarget
-from ps_calibration.synthetic import random_bench, render_stack, solid_of
-from ps_head_driver.calibration_file import apply
+from ps_calibration.motor_calibration import TiltReading, calibrate_motor
 from ps_head_driver.convergence_radius import CrSolver
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.fake.motor import Motor
@@ -86,36 +82,3 @@ def test_too_few_positions_are_refused(nominal: HeadModel) -> None:
     with pytest.raises(PsError, match='three or more') as refused:
         calibrate_motor([TiltReading(10000, 0.3), TiltReading(10000, 0.3)], nominal)
     assert refused.value.code is ErrorCode.CALIBRATION_BAD_REQUEST
-
-
-def test_pictures_from_both_sides_make_the_head_meet_cr(
-        nominal: HeadModel, target: RingTarget, motor: Motor) -> None:
-    """A head with panels, crank and play off, from pictures to the diameter on the plane."""
-    bench = random_bench(nominal, 3)
-    made = _real(bench.head)
-    real, truth = BrightFieldKinematics(made), CrSolver(made)
-    stops = [('up', 10000), ('up', 20000), ('up', 29000), ('down', 12000), ('down', 27000)]
-    stacks = []
-    for approach, counts in stops:
-        _go(motor, counts + (3000 if approach == 'down' else -3000))
-        stacks.append(render_stack(bench, nominal, solid_of(target), counts, 0.4, counts,
-                                   tilt=float(real.tilt(_go(motor, counts)))))
-    result = calibrate(stacks, target, nominal)
-    assert result.verdict == 'OK', result.reason
-    found = motor_of(result, stacks, nominal, [approach for approach, _ in stops])  # type: ignore
-    assert found is not None
-    assert found.backlash_counts == pytest.approx(PLAY, abs=60)
-    calibration = head_calibration(result, nominal, target).model_copy(
-        update={'motor': found.correction})
-    calibrated, before = CrSolver(apply(nominal, calibration)), CrSolver(nominal)
-    # CR is measured on the nominal plane
-    for wanted in (0.03, 0.05, 0.08, 0.12):
-        errors = []
-        for solver in (before, calibrated):
-            for approach, play in ((-3000, 0.0), (3000, found.backlash_counts)):
-                counts = round(solver.inverse(wanted).motor_counts - play)
-                _go(motor, counts + approach)
-                there = float(truth.evaluate(np.array([_go(motor, counts)]))[0][0])
-                errors.append(abs(there - wanted))
-        print(wanted, errors)
-        assert max(errors[2:]) < 2e-4 < max(errors[:2])

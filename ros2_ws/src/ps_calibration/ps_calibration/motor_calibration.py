@@ -138,8 +138,9 @@ def motor_of(result: Calibration, stacks: Sequence[Stack], head: HeadModel,
               for stack in stacks]
     if len(set(counts)) < _POSITIONS:
         return None
+    sides: Sequence[Approach] = approaches or ['up'] * len(counts)
     return calibrate_motor([TiltReading(*reading) for reading in zip(
-        counts, result.fit.tilts, approaches or ['up'] * len(counts), strict=True)], head)
+        counts, result.fit.tilts, sides, strict=True)], head)
 
 
 def _kinematics(head: HeadModel, correction: MotorCorrection) -> BrightFieldKinematics:

@@ -220,7 +220,7 @@ def test_cancel(client: CellClient, stage: int) -> None:
 @pytest.mark.parametrize(('goal', 'code', 'reason'), [
     ({'target_file': 'nowhere.yaml'}, ErrorCode.CALIBRATION_BAD_REQUEST, 'nowhere'),
     ({'convergence_radii': [-0.05]}, ErrorCode.CALIBRATION_BAD_REQUEST, 'positive'),
-    ({'convergence_radii': [1000.0]}, ErrorCode.CALIBRATION_CAPTURE_FAILED, 'UNREACHABLE'),
+    ({'convergence_radii': [1e6]}, ErrorCode.CALIBRATION_CAPTURE_FAILED, 'UNREACHABLE'),
     ({'working_directory': '../x'}, ErrorCode.CALIBRATION_BAD_REQUEST, 'leaves'),
     ({'target_file': '/etc/passwd'}, ErrorCode.CALIBRATION_BAD_REQUEST, 'leaves'),
 ])

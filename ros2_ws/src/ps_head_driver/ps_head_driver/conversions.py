@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image
 
-from ps_head_driver.calibration_file import HeadCalibration, PanelCorrection, Verdict, apply
+from ps_head_driver.calibration_file import (
+    HeadCalibration,
+    MotorCorrection,
+    PanelCorrection,
+    Verdict,
+    apply,
+)
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.frames import OPTICAL_FRAME, PLANE_FRAME
 from ps_head_driver.head_frames import Transform, static_transforms
@@ -301,7 +307,7 @@ def calibration_to_message(
     message = ps.HeadCalibration()
     message.header.frame_id = PLANE_FRAME
     message.plane_normal.z = 1.0
-    message.z_scale = 1.0
+    message.z_scale = message.motor_scale = 1.0
     message.transforms = [
         transform_to_message(each) for each in static_transforms(apply(head, calibration))]
     if calibration is None:
@@ -315,6 +321,9 @@ def calibration_to_message(
     message.plane_normal = vector_to_message(calibration.plane_normal)
     message.plane_offset = calibration.plane_offset
     message.backlash_counts = calibration.backlash_counts
+    message.motor_offset_counts = calibration.motor.offset_counts
+    message.motor_scale = calibration.motor.scale
+    message.crank_offset = calibration.motor.crank_offset
     message.z_scale = calibration.z_scale
     message.verdict = getattr(ps.HeadCalibration, f'VERDICT_{calibration.verdict}')
     message.verdict_reason = calibration.verdict_reason
@@ -349,5 +358,7 @@ def message_to_calibration(message: ps.HeadCalibration) -> HeadCalibration | Non
             shadow_residual_px=None if math.isnan(p.shadow_residual_px) else p.shadow_residual_px)
             for p in message.panels},
         backlash_counts=message.backlash_counts, z_scale=message.z_scale,
+        motor=MotorCorrection(offset_counts=message.motor_offset_counts,
+                              scale=message.motor_scale, crank_offset=message.crank_offset),
         verdict=verdicts.get(message.verdict, 'FAILED'), verdict_reason=message.verdict_reason,
         target_name=message.target_name))

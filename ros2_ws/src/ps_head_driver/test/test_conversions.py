@@ -169,11 +169,12 @@ def test_time_round_trip(stamp_ns):
 def test_calibration_round_trip():
     from datetime import UTC, datetime
 
-    from ps_head_driver.calibration_file import HeadCalibration, PanelCorrection
+    from ps_head_driver.calibration_file import HeadCalibration, MotorCorrection, PanelCorrection
     head = load_head(nominal_head_path())
     before = HeadCalibration(
         calibration_id='a', created=datetime(2026, 5, 6, tzinfo=UTC), head_serial='PS-1',
         camera=head.camera, verdict='POOR', verdict_reason='dirt',
+        motor=MotorCorrection(offset_counts=120.0, scale=1.01, crank_offset=0.002),
         panels={'BF_N': PanelCorrection(shift=(1e-3, 0.0, 0.0), shadow_residual_px=0.2),
                 'DF_E': PanelCorrection()})
     after = convert.message_to_calibration(convert.calibration_to_message(before, head))

@@ -5,7 +5,8 @@ frame shadowed where the prediction or the observation is too dark, and of the r
 darker 60 %, because gloss and light from neighbours only ever add.
 Few lights: the residual alone cannot tell a highlight from the attached shadow opposite, so drop
 frames that are dark against the brightest (attached shadow), then the frame whose half-vector
-comes closest to the normal, if that is close and the frame is too bright (highlight).
+comes closest to the normal, if that is close and the frame is brighter than noise explains
+(highlight): rejected by chance alone, bright frames would flatten every slope.
 `refine` then repeats the rejection against the object's own reflectance (reflectance.py).
 
 CHUNK pixels are worked on together. Their numbers lie in flat float32 buffers, quantity after
@@ -228,19 +229,23 @@ def _find_glossy(frame, index, pixels):    # type: ignore[no-untyped-def]
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def _drop_place(frame, index, pixels, only_bright):    # type: ignore[no-untyped-def]
-    """Drop this frame where it is PLACE; if ``only_bright``, only where it exceeds Lambert."""
+def _drop_place(frame, index, pixels, only_bright, margin):    # type: ignore[no-untyped-def]
+    """Drop this frame where it is PLACE.
+
+    :param only_bright: only where it exceeds Lambert's law by more than ``margin`` times |g|.
+    """
     for x in range(CHUNK):
         predicted = (pixels[G0 + x] * frame[D0 + x] + pixels[G1 + x] * frame[D1 + x]
                      + pixels[G2 + x] * frame[D2 + x])
-        limit = predicted if only_bright else np.float32(-1e30)
+        bright = predicted + margin * pixels[LENGTH + x]
+        limit = bright if only_bright else np.float32(-1e30)
         weight = frame[WEIGHT + x]
         drop = (pixels[PLACE + x] == index) & (frame[U + x] > limit)
         frame[WEIGHT + x] = np.float32(0) if drop else weight
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def first_of_few(frames, equations, pixels):    # type: ignore[no-untyped-def]
+def first_of_few(frames, margin, equations, pixels):    # type: ignore[no-untyped-def]
     """First estimate from few lights: weights 0 or 1 and scaled normals."""
     count = frames.shape[0]
     zero, one = np.float32(0), np.float32(1)
@@ -259,7 +264,7 @@ def first_of_few(frames, equations, pixels):    # type: ignore[no-untyped-def]
         for t in range(count):
             _find_dark(frames[t], np.float32(t), pixels)
         for t in range(count):
-            _drop_place(frames[t], np.float32(t), pixels, False)
+            _drop_place(frames[t], np.float32(t), pixels, False, zero)
         for x in range(CHUNK):
             pixels[LEFT + x] -= one if pixels[PLACE + x] >= zero else zero
     solve_frames(frames, equations, pixels)
@@ -271,7 +276,7 @@ def first_of_few(frames, equations, pixels):    # type: ignore[no-untyped-def]
     for t in range(count):
         _find_glossy(frames[t], np.float32(t), pixels)
     for t in range(count):
-        _drop_place(frames[t], np.float32(t), pixels, True)
+        _drop_place(frames[t], np.float32(t), pixels, True, np.float32(margin))
     solve_frames(frames, equations, pixels)
 
 
@@ -310,11 +315,12 @@ def refine(frames, coefficients, rounds, equations, pixels):    # type: ignore[n
 
 
 @numba.njit(nogil=True, cache=True)
-def estimate(frames, coefficients, rounds, rejecting, reflecting, equations, pixels):    # type: ignore[no-untyped-def]
+def estimate(frames, coefficients, margin, rounds, rejecting, reflecting, equations, pixels):    # type: ignore[no-untyped-def]
     """Robust scaled normals of a chunk: ``pixels`` hold LS on entry and the estimate on return.
 
     :param frames: (T, FRAME_SIZE), U to USABLE filled; returns WEIGHT and FACTOR.
     :param coefficients: (10,) float32 of the reflectance, for ``reflecting``.
+    :param margin: excess over Lambert's law, relative to |g|, that noise explains.
     """
     for t in range(frames.shape[0]):
         frames[t, WEIGHT:WEIGHT + CHUNK] = 1
@@ -324,7 +330,7 @@ def estimate(frames, coefficients, rounds, rejecting, reflecting, equations, pix
     if frames.shape[0] >= MANY:
         first_of_many(frames, equations, pixels)
     else:
-        first_of_few(frames, equations, pixels)
+        first_of_few(frames, margin, equations, pixels)
         for t in range(frames.shape[0]):         # what the first test dropped stays dropped
             for x in range(CHUNK):
                 frames[t, USABLE + x] = frames[t, WEIGHT + x]
@@ -333,7 +339,7 @@ def estimate(frames, coefficients, rounds, rejecting, reflecting, equations, pix
 
 
 @numba.njit(nogil=True, cache=True)
-def estimate_samples(u, d, h, usable, coefficients, rounds, rejecting, reflecting, g,    # type: ignore[no-untyped-def]
+def estimate_samples(u, d, h, usable, coefficients, margin, rounds, rejecting, reflecting, g,    # type: ignore[no-untyped-def]
                      first, last):
     """`estimate` for samples ``first`` to ``last``: u, usable (T, P), d, h (T, 3, P), g (3, P)."""
     count = len(u)
@@ -350,7 +356,7 @@ def estimate_samples(u, d, h, usable, coefficients, rounds, rejecting, reflectin
                     frame[H0 + m * CHUNK + x] = h[t, m, p]
             for m in range(3):
                 pixels[m * CHUNK + x] = g[m, p]
-        estimate(frames, coefficients, rounds, rejecting, reflecting, equations, pixels)
+        estimate(frames, coefficients, margin, rounds, rejecting, reflecting, equations, pixels)
         for x in range(min(CHUNK, last - begin)):
             for m in range(3):
                 g[m, begin + x] = pixels[m * CHUNK + x]

@@ -35,16 +35,25 @@ from ps_reconstruction.outliers import (
 )
 from ps_reconstruction.problem import GREY_WEIGHTS, MAX_PATCH, Problem, Solution
 from ps_reconstruction.stv_kernels import combine_patches, finish, solve_pixels
+from ps_reconstruction.stv_samples import (
+    noise_of,
+    places,
+    residuals,
+    samples,
+    spread_of,
+    view_nodes,
+)
 
 BAND, LEAST_BAND = 48, 16     # rows per band; fewer for many lights, to bound the memory
 BAND_FRAMES = 768             # rows times lights of a band
-SAMPLES, LEAST_SAMPLES = 4000, 1000     # pixels that the plan looks at, few or many lights
-SAMPLE_FRAMES = 64000         # pixels times lights of the plan
 SAMPLE_BAND = 512             # samples per core and call
 ROUNDS = 5                    # of the reflectance fit
 NOT_LAMBERTIAN = 0.04         # median misfit of LS from which few lights tell nothing more
 NOT_EXPLAINED = 0.05          # upper quartile of the misfit after rejection: likewise
+SIGNIFICANT = 3.0             # largest margin of a highlight, in standard deviations of the noise
+NOISE_ALONE = 1.15            # residuals of LS over noise, below which few lights see a matt part
 DOUBTFUL = (0.1, 0.15)        # median misfit of many lights: LS begins to count, counts fully
+FAR_WORSE = 1.5               # misfit with reflectance over that of rejection: not with few lights
 QUANTILE = 0.75               # of the misfits, by which the estimates are compared
 
 
@@ -93,6 +102,7 @@ class Plan:
     """What holds for the whole stack: the reflectance and how far to trust it.
 
     :param scatter: expected relative error of a pixel's own scaled normal.
+    :param margin: excess over Lambert's law, relative to |g|, that noise explains.
     :param hold: share of the LS normal added to the robust unit normal, 1 where many frames are
         explained badly: then neither is right and their errors partly cancel.
     """
@@ -101,6 +111,7 @@ class Plan:
     trust: Trust
     scatter: float = 0.0
     hold: float = 0.0
+    margin: float = 0.0
 
 
 def solve(problem: Problem, options: StvOptions | None = None, quality: bool = True,
@@ -120,7 +131,7 @@ def solve(problem: Problem, options: StvOptions | None = None, quality: bool = T
     reject, reflect = decided.trust > Trust.LEAST_SQUARES, decided.trust == Trust.REFLECTANCE
     coefficients = decided.coefficients.astype(np.float32)
     lights = _planes(problem.lights)
-    view = _planes(_view(problem))
+    view = _planes(view_nodes(problem))
     flat = (np.zeros((0, 0, 0), np.float32) if problem.reciprocal_flat is None
             else _planes(problem.reciprocal_flat))
     spatial = _spatial(options)
@@ -142,8 +153,8 @@ def solve(problem: Problem, options: StvOptions | None = None, quality: bool = T
         tally = np.zeros((4, *shape), np.float32)
         reason = np.zeros(shape, np.uint8)
         solve_band(grey, saturated, mask, lights, view, flat, problem.step, top, coefficients,
-                   options.rounds, reject, reflect, reference, scaled, equations, shading, tally,
-                   reason)
+                   decided.margin, options.rounds, reject, reflect, reference, scaled, equations,
+                   shading, tally, reason)
         inner = slice(first - top, last - top)
         if not reject:
             solved = reference[:, inner]
@@ -184,16 +195,25 @@ def plan(problem: Problem, options: StvOptions | None = None) -> Plan:
     the LS normal is added (`Plan.hold`).
     """
     options = options or StvOptions()
-    u, d, h, usable, g_ls = _samples(problem)
+    pixels = places(problem)
+    u, d, h, usable, g_ls = samples(problem, *pixels)
     lambertian = np.zeros(reflectance.TERMS)
     if problem.count == 3 or u.shape[1] == 0:
         return Plan(lambertian, Trust.LEAST_SQUARES)
+    margin, alone = 0.0, False
+    if problem.count < MANY:
+        noise, spread = noise_of(problem, *pixels), spread_of(residuals(u, d, g_ls))
+        alone = spread < NOISE_ALONE * noise
+        # Against what gloss adds: the less there is, the surer a highlight must be. This ratio of
+        # variance to deviation is the threshold known from wavelet denoising as BayesShrink.
+        gloss = max(spread ** 2 - noise ** 2, 1e-20) ** 0.5
+        margin = noise * min(SIGNIFICANT, noise / gloss)
 
     def estimated(coefficients: NDArray, trust: Trust) -> NDArray[np.float32]:
         g = g_ls.copy()
         single = coefficients.astype(np.float32)
         for_bands(g.shape[1], SAMPLE_BAND, lambda first, last: estimate_samples(
-            u, d, h, usable, single, options.rounds, trust > Trust.LEAST_SQUARES,
+            u, d, h, usable, single, margin, options.rounds, trust > Trust.LEAST_SQUARES,
             trust == Trust.REFLECTANCE, g, first, last))
         return g
 
@@ -223,13 +243,18 @@ def plan(problem: Problem, options: StvOptions | None = None) -> Plan:
     elif (middle[Trust.LEAST_SQUARES] > NOT_LAMBERTIAN
           or level[Trust.REJECTION] > NOT_EXPLAINED):
         trust = Trust.LEAST_SQUARES
+    elif alone:
+        trust = Trust.REJECTION       # a matt part: a reflectance would be fitted to the noise
     else:      # dropping frames always lowers the misfit of few; that alone must not count
         trust = max(choice for choice in Trust if level[choice] <= level[Trust.LEAST_SQUARES])
+        if level[trust] > FAR_WORSE * level[Trust.REJECTION]:
+            trust = Trust.REJECTION   # the reflectance did not come out
     hold = 0.0
     if problem.count >= MANY:
         low, high = DOUBTFUL
         hold = float(np.clip((middle[trust] - low) / (high - low), 0, 1))
-    return Plan(coefficients, trust, max(level[trust] * (4 / problem.count) ** 0.5, 1e-4), hold)
+    return Plan(coefficients, trust, max(level[trust] * (4 / problem.count) ** 0.5, 1e-4), hold,
+                margin)
 
 
 def _misfit(u: NDArray, d: NDArray, h: NDArray, g: NDArray, coefficients: NDArray) -> NDArray:
@@ -245,65 +270,6 @@ def _misfit(u: NDArray, d: NDArray, h: NDArray, g: NDArray, coefficients: NDArra
 def _planes(grid: NDArray) -> NDArray[np.float32]:
     """Nodes (gh, gw, ...) as float32 planes (..., gh, gw)."""
     return np.ascontiguousarray(np.moveaxis(grid, (0, 1), (-2, -1)), np.float32)
-
-
-def _samples(problem: Problem) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
-    """Some thousand pixels spread over the mask.
-
-    :returns: u (T, P), d (T, 3, P), h (T, 3, P), usable (T, P) 0 or 1, g_ls (3, P), float32.
-    """
-    height, width = problem.shape
-    most = max(LEAST_SAMPLES, min(SAMPLES, SAMPLE_FRAMES // problem.count))
-    if problem.mask is None:
-        # an odd stride off the width walks through all columns
-        stride = max(1, height * width // most) | 1
-        index = np.arange(0, height * width, stride + 2 * (width % stride == 0))
-    else:
-        index = np.flatnonzero(problem.mask)
-        index = index[::max(1, len(index) // most)]
-    row, column = np.divmod(index, width)
-    nodes = (row / problem.step, column / problem.step)
-    lights = _interpolate(problem.lights, *nodes)
-    view = _interpolate(_view(problem), *nodes)
-    weights = np.array(GREY_WEIGHTS) if problem.colour else np.ones(1)
-    values, usable = np.empty(lights.shape[:2]), np.ones(lights.shape[:2], np.bool_)
-    dark = (0.0 if problem.ambient is None
-            else problem.ambient[row, column].reshape(len(row), -1).astype(np.float64))
-    for t, (frame, scale) in enumerate(zip(problem.frames, problem.scale, strict=True)):
-        raw = frame[row, column].reshape(len(row), -1).astype(np.float64)
-        usable[:, t] = raw.max(axis=1) < problem.saturation
-        values[:, t] = np.minimum((raw - dark) * scale, problem.clip) @ weights
-    if problem.reciprocal_flat is not None:
-        values *= _interpolate(problem.reciprocal_flat, *nodes)
-    lit = values.mean(axis=1) > 0
-    values, lights, view, usable = values[lit], lights[lit], view[lit], usable[lit]
-    g_ls = np.einsum('pit,pt->pi', np.linalg.pinv(lights), values)
-    irradiance = np.linalg.norm(lights, axis=2)
-    d = lights / irradiance[..., None]
-    h = d + view[:, None]
-    h /= np.linalg.norm(h, axis=2, keepdims=True)
-    u, d, h = (np.moveaxis(a, 0, -1) for a in (values / irradiance, d, h))
-    single = [np.ascontiguousarray(a, np.float32) for a in (u, d, h, usable.T, g_ls.T)]
-    return single[0], single[1], single[2], single[3], single[4]
-
-
-def _interpolate(grid: NDArray, row: NDArray, column: NDArray) -> NDArray:
-    """Bilinear interpolation of nodes at P positions given in nodes, (gh, gw, ...) to (P, ...)."""
-    i = np.minimum(row.astype(int), grid.shape[0] - 2)
-    j = np.minimum(column.astype(int), grid.shape[1] - 2)
-    fy, fx = (f.reshape(-1, *(1,) * (grid.ndim - 2)) for f in (row - i, column - j))
-    result: NDArray = ((1 - fy) * ((1 - fx) * grid[i, j] + fx * grid[i, j + 1])
-                       + fy * ((1 - fx) * grid[i + 1, j] + fx * grid[i + 1, j + 1]))
-    return result
-
-
-def _view(problem: Problem) -> NDArray[np.float64]:
-    """Directions to the camera at the nodes; from straight above where unknown."""
-    if problem.view is not None:
-        return problem.view
-    view = np.zeros((*problem.lights.shape[:2], 3))
-    view[..., 2] = 1
-    return view
 
 
 def _spatial(options: StvOptions) -> NDArray[np.float32]:

@@ -54,8 +54,9 @@ SIDE = CHUNK + MAX_PATCH - 1                # of a chunk with its neighbours
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coefficients, rounds,    # type: ignore[no-untyped-def]
-                 rejecting, reflecting, reference, scaled, equations, shading, quality, reason):
+def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coefficients, margin,    # type: ignore[no-untyped-def]
+                 rounds, rejecting, reflecting, reference, scaled, equations, shading, quality,
+                 reason):
     """Temporal weights, own estimate and normal equations of every pixel of a band.
 
     :param values: (T, h, W) intensities, before the flat field.
@@ -110,7 +111,7 @@ def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coeffic
             solve_equations(system, pixels)
             for m in range(3):
                 reference[m, y, begin:end] = pixels[m * CHUNK:m * CHUNK + n]
-            estimate(frames, coefficients, rounds, rejecting, reflecting, system, pixels)
+            estimate(frames, coefficients, margin, rounds, rejecting, reflecting, system, pixels)
             system[:] = 0
             for t in range(count):
                 judge(frames[t], pixels, sums, flags)

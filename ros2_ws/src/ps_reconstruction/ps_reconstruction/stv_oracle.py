@@ -79,7 +79,8 @@ def pixel(u: NDArray, d: NDArray, h: NDArray, usable: NDArray, g: NDArray, decid
     if decided.trust == Trust.LEAST_SQUARES:
         return g, np.ones(len(u), np.bool_), np.ones(len(u))
     factor = np.ones(len(u))
-    g, keep = _first_of_many(u, d, usable) if len(u) >= MANY else _first_of_few(u, d, h, usable)
+    g, keep = _first_of_many(u, d, usable) if len(u) >= MANY else _first_of_few(
+        u, d, h, usable, decided.margin)
     if decided.trust == Trust.REFLECTANCE:
         if len(u) < MANY:
             usable = keep
@@ -104,7 +105,8 @@ def _first_of_many(u: NDArray, d: NDArray, usable: NDArray) -> tuple[NDArray, ND
     return g, keep
 
 
-def _first_of_few(u: NDArray, d: NDArray, h: NDArray, usable: NDArray) -> tuple[NDArray, NDArray]:
+def _first_of_few(u: NDArray, d: NDArray, h: NDArray, usable: NDArray, margin: float
+                  ) -> tuple[NDArray, NDArray]:
     keep = usable.copy()
     while keep.sum() > 3:
         darkest = np.flatnonzero(keep)[np.argmin(u[keep])]
@@ -115,7 +117,7 @@ def _first_of_few(u: NDArray, d: NDArray, h: NDArray, usable: NDArray) -> tuple[
     if keep.sum() > 3:
         cosine = np.where(keep, h @ g / np.linalg.norm(g), -1)
         glossy = np.argmax(cosine)
-        if cosine[glossy] > GATE and u[glossy] > d[glossy] @ g:
+        if cosine[glossy] > GATE and u[glossy] > d[glossy] @ g + margin * np.linalg.norm(g):
             keep[glossy] = False
             g = _fit(d, u, keep, g)
     return g, keep

@@ -5,11 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ps_head_driver.convergence_radius import inverse
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_head_driver.head_model import CameraGeometry
+from ps_head_driver.fake.renderer import make_renderer
+from ps_head_driver.head_model import CameraGeometry, load_head, nominal_head_path
+from ps_head_driver.kinematics import lights_at
 from ps_head_driver.stack import Light, Panel, Plane, Stack, angular_error_deg
 from ps_reconstruction.near_field import photometric_problem
-from ps_reconstruction.pipeline import OUTPUTS, Options, reconstruct
+from ps_reconstruction.pipeline import METHODS, OUTPUTS, Options, reconstruct
 from ps_reconstruction.problem import SATURATED, expand
 
 
@@ -54,6 +57,29 @@ def test_height_rounds_make_the_dome_right(render: Callable) -> None:
     height = reconstruct(stack, outputs={'height'}).height
     assert height is not None
     assert np.abs(height - (z - np.median(z))).mean() < 1e-5
+
+
+@pytest.fixture(scope='module')
+def boss() -> tuple[Stack, np.ndarray]:
+    """Noisy pictures of a matt boss of 1 mm and its height."""
+    head = load_head(nominal_head_path())
+    setting = inverse(head, 0.06)
+    renderer = make_renderer('boss', head, scale=0.3)
+    images = [renderer.render(setting.tilt, 1.3, list(levels), exposure=0.004, frame=i)
+              for i, levels in enumerate(np.eye(4))]
+    height = renderer.truth().height
+    assert height is not None
+    return Stack(images, lights_at(head, setting.motor_counts, 1.3)[:4], renderer.camera), height
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_a_matt_boss_keeps_its_height(method: str, boss: tuple[Stack, np.ndarray]) -> None:
+    """Noise alone must not make a robust method flatten the slopes of a matt part."""
+    stack, truth = boss
+    height = reconstruct(stack, Options(method=method), {'height'}).height
+    assert height is not None
+    scale = np.polyfit(truth.ravel(), height.ravel(), 1)[0]
+    assert scale == pytest.approx(1, abs=0.01)
 
 
 def test_grid_interpolation_error_is_negligible(render: Callable) -> None:

@@ -96,6 +96,24 @@ def test_without_patches_equals_the_oracle_pixel_by_pixel(trust: Trust) -> None:
     assert np.nanpercentile(deviation, 95) < 0.2
 
 
+def test_what_noise_explains_is_no_highlight_here_nor_in_the_oracle() -> None:
+    normal, mask = sphere(96, limit=0.4)
+    problem = render(normal, mask, lights_of(4), noise=0.01)
+    options = StvOptions(patch=1, ridge=0.0)
+    decided = stv.plan(problem, options)
+    assert decided.trust == Trust.REJECTION
+    # relative to |g| = 0.5; LS leaves a quarter of the variance of four lights in the residuals
+    sigma = 0.01 / 0.5 / 2
+    assert 1.5 * sigma < decided.margin < 3.3 * sigma
+    solution, plain = stv.solve(problem, options), least_squares.solve(problem)
+    g = stv_oracle.solve(problem, options, decided)
+    np.testing.assert_allclose(scaled(solution)[mask], g[mask], atol=1e-4)
+    same = errors(solution.normal, plain.normal.astype(float), mask) < 0.01
+    assert same.mean() > 0.98
+    eager = stv.solve(problem, options, decided=dataclasses.replace(decided, margin=0.0))
+    assert (errors(eager.normal, plain.normal.astype(float), mask) < 0.01).mean() < 0.6
+
+
 def test_the_solution_lowers_the_objective_of_equation_6() -> None:
     """Huber loss over the believed frames plus ridge, f s as light vectors: below that of LS."""
     normal, mask = sphere(24, limit=0.6)

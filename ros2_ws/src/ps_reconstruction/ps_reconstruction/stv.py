@@ -53,7 +53,7 @@ NOT_EXPLAINED = 0.05          # upper quartile of the misfit after rejection: li
 SIGNIFICANT = 3.0             # largest margin of a highlight, in standard deviations of the noise
 NOISE_ALONE = 1.15            # residuals of LS over noise, below which few lights see a matt part
 DOUBTFUL = (0.1, 0.15)        # median misfit of many lights: LS begins to count, counts fully
-FAR_WORSE = 1.5               # misfit with reflectance over that of rejection: not with few lights
+FAR_WORSE = 3.0               # misfit with reflectance over that of rejection: not with few lights
 QUANTILE = 0.75               # of the misfits, by which the estimates are compared
 
 
@@ -191,8 +191,9 @@ def plan(problem: Problem, options: StvOptions | None = None) -> Plan:
 
     The choice compares how well each estimate predicts all frames of the samples, the rejected
     ones included: |difference| / mean intensity of the pixel, its upper quartile. Few lights must
-    also be explained well by a matt body and a few outliers; where many lights are not, part of
-    the LS normal is added (`Plan.hold`).
+    also be explained well by a matt body and a few outliers, and get no reflectance where LS
+    leaves only noise; where many lights are explained badly, part of the LS normal is added
+    (`Plan.hold`).
     """
     options = options or StvOptions()
     pixels = places(problem)
@@ -205,7 +206,8 @@ def plan(problem: Problem, options: StvOptions | None = None) -> Plan:
         noise, spread = noise_of(problem, *pixels), spread_of(residuals(u, d, g_ls))
         alone = spread < NOISE_ALONE * noise
         # Against what gloss adds: the less there is, the surer a highlight must be. This ratio of
-        # variance to deviation is the threshold known from wavelet denoising as BayesShrink.
+        # variance to deviation is the threshold known from wavelet denoising as BayesShrink
+        # (Chang, Yu and Vetterli, 2000).
         gloss = max(spread ** 2 - noise ** 2, 1e-20) ** 0.5
         margin = noise * min(SIGNIFICANT, noise / gloss)
 

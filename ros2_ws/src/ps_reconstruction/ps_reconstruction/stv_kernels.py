@@ -64,6 +64,7 @@ def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coeffic
     :param mask: (h, W) bool.
     :param lights: (T, 3, gh, gw) at the nodes; view: (3, gh, gw); flat: (T, gh, gw) reciprocal
         flat field, or of size 0. ``top`` is the image row of the band's first row.
+    :param margin: excess over Lambert's law, relative to |g|, that noise explains.
     :param reference: (3, h, W) out, least squares.
     :param scaled: (3, h, W) out, the pixel's own robust estimate; 0 where there is none.
     :param equations: (9, h, W) out, xx xy xz yy yz zz of the matrix and the right side.

@@ -169,10 +169,13 @@ def test_genicam_camera_stepped_by_the_host_lost_and_found(tmp_path: Path):
     settings = tmp_path / 'settings.yaml'
     settings.write_text('/**:\n  ros__parameters:\n    sequencing: host\n'
                         '    camera_id: 127.0.0.1\n    max_motion: 0.0\n')
-    arguments = {'fake_hardware': 'true', 'camera': 'genicam', 'params_file': str(settings)}
+    # a namespace of its own: the cell of the topic camera is still there
+    arguments = {'fake_hardware': 'true', 'camera': 'genicam', 'params_file': str(settings),
+                 'namespace': 'ps_genicam'}
     with open(Path(tempfile.gettempdir()) / 'ps_test_gige.lock', 'w') as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)      # the fake camera's port is fixed
-        with Cell(arguments, nodes=NEEDED, log_folder=tmp_path), CellClient() as client:
+        with Cell(arguments, nodes=NEEDED, log_folder=tmp_path), \
+                CellClient('ps_genicam') as client:
             client.home()
             with pytest.raises(PsError) as error:
                 client.capture()

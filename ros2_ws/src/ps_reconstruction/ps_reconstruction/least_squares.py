@@ -158,7 +158,11 @@ def check_lights(lights: NDArray) -> None:
                       f'{count} frames lit by a single panel; photometric stereo needs at least 3')
     if not np.all(np.isfinite(lights)):
         raise PsError(ErrorCode.RECONSTRUCTION_BAD_STACK, 'lights: light vectors are not finite')
-    square = np.linalg.eigvalsh(np.swapaxes(lights, -1, -2) @ lights)
+    with np.errstate(over='ignore', invalid='ignore'):
+        gram = np.swapaxes(lights, -1, -2) @ lights
+    if not np.all(np.isfinite(gram)):           # as of an intensity of 1e200
+        raise PsError(ErrorCode.RECONSTRUCTION_BAD_STACK, 'lights: light vectors are too long')
+    square = np.linalg.eigvalsh(gram)
     condition = float(np.sqrt(np.max(
         square[..., 2] / np.maximum(square[..., 0], 1e-14 * square[..., 2] + 1e-300))))
     if not np.all(square[..., 2] > 1e-100):     # as of a light that is infinitely far away

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_reconstruction.least_squares import solve, solve_reference
+from ps_reconstruction.least_squares import check_lights, solve, solve_reference
 from ps_reconstruction.problem import (
     GREY_WEIGHTS,
     SATURATED,
@@ -160,3 +160,9 @@ def test_scaling_the_pictures_scales_the_albedo_only() -> None:
     first, second = solve(problem), solve(replace(problem, scale=problem.scale * 3))
     np.testing.assert_allclose(first.normal, second.normal, atol=1e-6)
     np.testing.assert_allclose(first.albedo * 3, second.albedo, rtol=1e-5)
+
+
+def test_lights_too_strong_to_compute_with_are_refused():
+    with pytest.raises(PsError, match='too long') as error:
+        check_lights(np.eye(3)[None] * 1e200)
+    assert error.value.code == ErrorCode.RECONSTRUCTION_BAD_STACK

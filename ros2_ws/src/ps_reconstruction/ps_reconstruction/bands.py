@@ -1,7 +1,8 @@
 """Work spread over the cores in bands of image rows.
 
 The compiled kernels release the GIL and know nothing of threads; the bands and their order do not
-depend on the number of cores, so results are bit-identical everywhere.
+depend on the number of cores, so results are bit-identical everywhere. The calling thread does its
+share of the work, so calls may come from several threads or from within a band.
 """
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +24,7 @@ def core_count() -> int:
 
 @functools.cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(core_count(), thread_name_prefix='ps_band')
+    return ThreadPoolExecutor(max(1, core_count() - 1), thread_name_prefix='ps_band')
 
 
 def for_bands(rows: int, band: int, work: Callable[[int, int], Result]) -> list[Result]:
@@ -32,6 +33,19 @@ def for_bands(rows: int, band: int, work: Callable[[int, int], Result]) -> list[
     :returns: what the calls returned, top band first. The first exception is raised again.
     """
     edges = [(first, min(first + band, rows)) for first in range(0, rows, band)]
-    if core_count() == 1 or len(edges) == 1:
-        return [work(*edge) for edge in edges]
-    return list(_pool().map(lambda edge: work(*edge), edges))
+    results: dict[int, Result] = {}
+    waiting = iter(range(len(edges)))     # its next() is atomic: the threads share it
+
+    def take() -> None:
+        for number in waiting:
+            results[number] = work(*edges[number])
+
+    helpers = [_pool().submit(take) for _ in range(min(core_count(), len(edges)) - 1)]
+    try:
+        take()
+    finally:
+        # one that the pool has not begun yet is not needed any more
+        for helper in helpers:
+            if not helper.cancel():
+                helper.result()
+    return [results[number] for number in range(len(edges))]

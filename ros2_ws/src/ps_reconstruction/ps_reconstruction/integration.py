@@ -18,6 +18,7 @@ import scipy.fft
 
 from ps_reconstruction import backend
 from ps_reconstruction.bands import core_count, for_bands
+from ps_reconstruction.problem import expand
 
 BAND = 32
 FAST = {'contract', 'reassoc', 'arcp', 'nsz', 'afn'}
@@ -58,7 +59,7 @@ def height_from_normals(
     """
     du, dv = gradients(normal, rays)
     w = (solver or poisson)(du, dv)
-    return _metric(w, normal, rays, plane_normal, plane_offset)
+    return metric_height(w, normal, rays, plane_normal, plane_offset)
 
 
 def gradients(normal: NDArray[np.float32], rays: Rays
@@ -79,14 +80,17 @@ def gradients(normal: NDArray[np.float32], rays: Rays
     return du, dv
 
 
-def poisson(du: NDArray[np.float32], dv: NDArray[np.float32]) -> NDArray[np.float32]:
+def poisson(du: NDArray[np.float32], dv: NDArray[np.float32], short_px: float = 0.0,
+            long_px: float = 0.0, pole_px: float = 0.0) -> NDArray[np.float32]:
     """Least-squares integral of a gradient field by cosine transforms (Neumann borders).
 
     :param du: (H, W) derivative along the columns axis at the pixels, NaN counts as 0.
     :param dv: (H, W) derivative along the rows axis.
+    :param short_px, long_px, pole_px: filters on the way, see `solve_poisson`.
     :returns: (H, W) float32 with zero mean.
     """
-    return backend.kernel('solve_poisson', solve_poisson)(divergence(du, dv))
+    solve = backend.kernel('solve_poisson', solve_poisson)
+    return solve(divergence(du, dv), short_px, long_px, pole_px)
 
 
 def divergence(du: NDArray[np.float32], dv: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -162,9 +166,15 @@ def remove_plane(height: NDArray[np.float32], rounds: int = 3) -> NDArray[np.flo
     return height - plane.astype(np.float32)
 
 
-def _metric(w: NDArray, normal: NDArray, rays: Rays,
-            plane_normal: tuple[float, float, float], plane_offset: float) -> NDArray[np.float32]:
-    """Turn w (or z, parallel projection) into height above the plane with median zero."""
+def metric_height(
+    w: NDArray[np.float32], normal: NDArray[np.float32], rays: Rays,
+    plane_normal: tuple[float, float, float] = (0.0, 0.0, 1.0), plane_offset: float = 0.0,
+) -> NDArray[np.float32]:
+    """Turn w (or z, parallel projection) into height above the plane, metres, median zero.
+
+    :param w: (H, W), the integral of the gradients.
+    :param normal: (H, W, 3); the height is NaN where it is.
+    """
     height = np.empty(w.shape, np.float32)
     nx, ny, nz = plane_normal
     nodes = rays.nodes
@@ -176,17 +186,21 @@ def _metric(w: NDArray, normal: NDArray, rays: Rays,
         base = 0.0
         slope = nx * nodes[..., 0] + ny * nodes[..., 1]
 
-    def fill(constant: float, values: NDArray, lattice: int, out: NDArray) -> None:
-        def work(first: int, last: int) -> None:
-            _height_rows(w, normal, slope, rays.step, first, last, lattice, base, constant, nz,
-                         not np.isfinite(rays.standoff), out)
-        for_bands(len(values), BAND, work)
-
+    parallel = not np.isfinite(rays.standoff)
     lattice = max(1, int(np.sqrt(w.size / 50000)))
-    sample = np.full((-(-w.shape[0] // lattice), -(-w.shape[1] // lattice)), np.nan, np.float32)
-    fill(np.nan, sample, lattice, sample)
+    sample = w[::lattice, ::lattice].astype(np.float64)
+    sloped = expand(slope, rays.step, (w.shape[0], w.shape[1]), lattice)
+    # parallel: the distances; else ln of the depth at which a pixel would lie on the plane, less w
+    sample = sample * nz + sloped if parallel else np.log(base / sloped) - sample
+    sample[np.isnan(normal[::lattice, ::lattice, 2])] = np.nan
     constant = float(np.nanmedian(sample)) if np.isfinite(sample).any() else 0.0
-    fill(constant, height, 1, height)
+
+    def work(first: int, last: int) -> None:
+        rows = slice(first, last)
+        _height_rows(w[rows], normal[rows], slope, rays.step, first, base, constant, nz, parallel,
+                     height[rows])
+
+    for_bands(len(height), BAND, work)
     return height
 
 
@@ -259,30 +273,41 @@ def _divide_rows(spectrum, column, row, short_y, short_x,    # type: ignore[no-u
             spectrum[y, x] *= passed / (eigenvalue - pole) if eigenvalue < 0 else np.float32(0)
 
 
-@numba.njit(nogil=True, cache=True, error_model='numpy')
-def _height_rows(w, normal, slope, step, first, last, lattice,    # type: ignore[no-untyped-def]
-                 base, constant, plane_z, parallel, out):
-    """Heights on every ``lattice``-th pixel; a NaN ``constant`` asks what it would have to be."""
-    for row in range(first, last):
-        y = row * lattice
-        i = y // step
-        fy = (y - i * step) / step
-        for column in range(out.shape[1]):
-            x = column * lattice
-            if np.isnan(normal[y, x, 2]):
-                out[row, column] = np.nan
-                continue
-            j = x // step
-            fx = (x - j * step) / step
-            top = slope[i, j] + fx * (slope[i, j + 1] - slope[i, j])
-            bottom = slope[i + 1, j] + fx * (slope[i + 1, j + 1] - slope[i + 1, j])
-            s = top + fy * (bottom - top)
-            value = np.float64(w[y, x])
-            if parallel:
-                distance = value * plane_z + s
-                out[row, column] = distance if np.isnan(constant) else distance - constant
-            elif np.isnan(constant):
-                # ln of the depth at which this pixel would lie on the plane, less its w
-                out[row, column] = np.log(base / s) - value
-            else:
-                out[row, column] = base - np.exp(value + constant) * s
+@numba.njit(nogil=True, cache=True, fastmath=FAST)
+def _exp(value):    # type: ignore[no-untyped-def]
+    """The exponential as arithmetic that vectorises, four times faster than the library's.
+
+    Good to 2e-9 for |value| <= 1, depths within a factor e of their mean, and positive and
+    increasing wherever else a picture could get to.
+    """
+    x = 0.125 * value
+    e = 1 + x * (1 + x * (1 / 2 + x * (1 / 6 + x * (1 / 24 + x * (1 / 120 + x / 720)))))
+    e *= e
+    e *= e
+    return e * e
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def _height_rows(w, normal, slope, step, first, base, constant,    # type: ignore[no-untyped-def]
+                 plane_z, parallel, out):
+    """Heights of the rows from ``first``."""
+    rows, width = out.shape
+    unit, scale = 1 / step, np.exp(constant)
+    for y in range(rows):
+        i = (first + y) // step
+        fy = ((first + y) - i * step) * unit
+        for j in range((width - 1) // step + 1):
+            left = slope[i, j] + fy * (slope[i + 1, j] - slope[i, j])
+            change = slope[i, j + 1] + fy * (slope[i + 1, j + 1] - slope[i, j + 1]) - left
+            begin, end = j * step, min((j + 1) * step, width)
+            source, target, facing = w[y, begin:end], out[y, begin:end], normal[y, begin:end]
+            for x in range(end - begin):
+                s = left + change * (x * unit)
+                value = np.float64(source[x])
+                if parallel:
+                    target[x] = value * plane_z + s - constant
+                else:
+                    target[x] = base - _exp(value) * (scale * s)
+            for x in range(end - begin):
+                if np.isnan(facing[x, 2]):
+                    target[x] = np.nan

@@ -280,8 +280,8 @@ def _reduced(stack: Stack) -> tuple[Stack, int]:
 def _block_means(image: NDArray, factor: int, rows: int, columns: int, scale: float
                  ) -> NDArray[np.float32]:
     """Mean of factor x factor pixels, times ``scale``; worth more than the 8 bits of a pixel."""
-    planes = image.reshape(*image.shape[:2], -1)
-    out = np.empty((rows, columns, planes.shape[2]), np.float32)
+    planes = image.reshape(len(image), -1)
+    out = np.empty((rows, columns, image[0, 0].size), np.float32)
     for_bands(rows, 8, lambda i, j: _block_rows(
         planes[i * factor:j * factor], factor, np.float32(scale / factor ** 2), out[i:j]))
     return out.reshape(rows, columns, *image.shape[2:])
@@ -290,11 +290,17 @@ def _block_means(image: NDArray, factor: int, rows: int, columns: int, scale: fl
 @numba.njit(nogil=True, cache=True)
 def _block_rows(planes, factor, scale, out):    # type: ignore[no-untyped-def]
     rows, columns, channels = out.shape
+    # sums over the rows first, which is vectorised; exact for integers
+    line = np.empty(columns * factor * channels, np.float32)
     for y in range(rows):
+        line[:] = np.float32(0)
+        for b in range(factor):
+            row = planes[y * factor + b]
+            for i in range(len(line)):
+                line[i] += np.float32(row[i])
         for x in range(columns):
             for c in range(channels):
                 total = np.float32(0)
-                for b in range(factor):
-                    for a in range(factor):
-                        total += np.float32(planes[y * factor + b, x * factor + a, c])
+                for a in range(factor):
+                    total += line[(x * factor + a) * channels + c]
                 out[y, x, c] = total * scale

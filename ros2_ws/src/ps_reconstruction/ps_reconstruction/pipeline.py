@@ -1,5 +1,5 @@
 """One stack in, all asked-for surface quantities out. Pure and deterministic, no ROS."""
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -123,11 +123,14 @@ class Reconstruction:
     residual_rms: float = float('nan')
 
 
-def reconstruct(stack: Stack, options: Options | None = None,
-                outputs: set[str] | None = None) -> Reconstruction:
+def reconstruct(
+    stack: Stack, options: Options | None = None, outputs: set[str] | None = None,
+    on_ready: Callable[[Reconstruction, str], None] = lambda result, name: None,
+) -> Reconstruction:
     """Reconstruct a stack.
 
     :param outputs: names of OUTPUTS; None for all. Only these and what they need are computed.
+    :param on_ready: called with the name of a wanted picture as soon as the result holds it.
     :raises PsError: RECONSTRUCTION_* naming what is wrong with the stack or an option.
     """
     options = options or Options()
@@ -161,24 +164,27 @@ def reconstruct(stack: Stack, options: Options | None = None,
     # pixels that the mask leaves out are no failures
     used = valid.size if stack.mask is None else np.count_nonzero(stack.mask)
     result.valid_fraction = np.count_nonzero(valid) / used
-    if 'albedo' in wanted:
-        result.albedo = solution.albedo
-    if 'confidence' in wanted:
-        result.confidence = solution.confidence
-    if 'reason' in wanted:
-        result.reason = solution.reason
     if 'slope' in wanted:
         with _timed(timings, 'slope'):
             result.slope = surface.slope(solution.normal)
-    if wanted & {'height', 'shape', 'roughness'}:
-        _integrate(result, stack, rays, options, wanted, solution)
+        on_ready(result, 'slope')
+    if 'normal' in wanted:
+        on_ready(result, 'normal')
+    for name in ('albedo', 'confidence', 'reason'):
+        if name in wanted:
+            setattr(result, name, getattr(solution, name))
+            on_ready(result, name)
     if 'curvature' in wanted:
         with _timed(timings, 'curvature'):
             result.curvature = surface.mean_curvature(
                 solution.normal, pitch, options.smoothness)
+        on_ready(result, 'curvature')
     if 'preview' in wanted:
         with _timed(timings, 'preview'):
             result.preview = preview.normal_preview(solution.normal)
+        on_ready(result, 'preview')
+    if wanted & {'height', 'shape', 'roughness'}:
+        _integrate(result, stack, rays, options, wanted, solution, on_ready)
     return result
 
 
@@ -224,20 +230,23 @@ def _pitch(stack: Stack, options: Options) -> float:
 
 
 def _integrate(result: Reconstruction, stack: Stack, rays: integration.Rays, options: Options,
-               wanted: set[str], solution: Solution) -> None:
+               wanted: set[str], solution: Solution,
+               on_ready: Callable[[Reconstruction, str], None]) -> None:
     timings = result.timings
     plane = stack.plane
+    with _timed(timings, 'gradients'):
+        du, dv = integration.gradients(result.normal, rays)
     if 'height' in wanted:
         with _timed(timings, 'height'):
-            solver = None
+            solver: Callable[..., NDArray[np.float32]] = integration.poisson
             if options.careful:
                 pitch = 1 / stack.camera.fx if stack.camera is not None else result.pixel_pitch
                 solver = partial(integrate, confidence=solution.confidence, pitch=pitch)
             elif np.count_nonzero(result.mask) < WHOLE * result.mask.size:
                 # the cosine transform would pull the rim of a masked part down to flat ground
                 solver = partial(integrate, steepness=0.0, tolerance=1e-3)
-            result.height = integration.height_from_normals(
-                result.normal, rays, plane.normal, plane.offset, solver)
+            result.height = integration.metric_height(
+                solver(du, dv), result.normal, rays, plane.normal, plane.offset)
             form = options.form
             if form == 'auto':
                 form = 'slow' if stack.geometry == Geometry.ASSUMED else 'none'
@@ -245,10 +254,9 @@ def _integrate(result: Reconstruction, stack: Stack, rays: integration.Rays, opt
                 result.height = integration.remove_plane(result.height)
             elif form == 'slow':
                 result.height = surface.without_slow_form(result.height, max(stack.shape) / 16)
-    if wanted & {'shape', 'roughness'}:
-        du, dv = integration.gradients(result.normal, rays)
-        # the perspective integral is ln(depth): higher is less
-        metres = 1.0 if stack.camera is None else -result.pixel_pitch * stack.camera.fx
+        on_ready(result, 'height')
+    # the perspective integral is ln(depth): higher is less
+    metres = 1.0 if stack.camera is None else -result.pixel_pitch * stack.camera.fx
     if 'shape' in wanted:
         with _timed(timings, 'shape'):
             relief = surface.relief(
@@ -257,6 +265,7 @@ def _integrate(result: Reconstruction, stack: Stack, rays: integration.Rays, opt
             # one pixel pitch of height in the unit of the integral
             unit = result.pixel_pitch / metres
             result.shape = surface.shape_image(relief, result.mask, options.contrast, unit)
+        on_ready(result, 'shape')
     if 'roughness' in wanted and result.metric:
         with _timed(timings, 'roughness'):
             result.roughness = surface.roughness(

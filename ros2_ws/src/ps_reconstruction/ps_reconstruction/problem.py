@@ -102,13 +102,16 @@ def constant_lights(vectors: NDArray, shape: tuple[int, int]) -> tuple[NDArray[n
     return grid, max(2, *shape)
 
 
-def expand(grid: NDArray, step: int, shape: tuple[int, int]) -> NDArray[np.float64]:
+def expand(grid: NDArray, step: int, shape: tuple[int, int], lattice: int = 1
+           ) -> NDArray[np.float64]:
     """Bilinear interpolation of nodes to every pixel, (gh, gw, ...) to (H, W, ...).
 
     For tests, oracles and coarse images: a full-size expansion takes much memory.
+
+    :param lattice: only every so many rows and columns.
     """
     def weights(n: int, nodes: int) -> tuple[NDArray, NDArray]:
-        position = np.arange(n) / step
+        position = np.arange(0, n, lattice) / step
         low = np.minimum(position.astype(int), nodes - 2)
         return low, position - low
 

@@ -11,12 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ps_reconstruction.bands import for_bands
-from ps_reconstruction.integration import (
-    BAND,
-    divergence,
-    remove_plane,
-    solve_poisson,
-)
+from ps_reconstruction.integration import BAND, poisson, remove_plane
 
 # sigma of the ISO 16610 Gaussian over its cut-off wavelength: sqrt(ln 2 / 2) / pi
 SIGMA_PER_CUTOFF = float(np.sqrt(np.log(2) / 2) / np.pi)
@@ -54,16 +49,9 @@ def mean_curvature(normal: NDArray[np.float32], pitch: float, sigma_px: float = 
     """
     valid = np.isfinite(normal[..., 2])
     n_x, n_y = (smooth(normal[..., a], valid, sigma_px) for a in (0, 1))
-    # derivatives across three pixels; rows count downwards, y upwards
-    n_x[~valid] = np.nan
-    n_y[~valid] = np.nan
-    out = np.full(valid.shape, np.nan, np.float32)
+    out = np.empty(valid.shape, np.float32)
     scale = np.float32(-0.25 / pitch)
-    out[1:-1, 1:-1] = scale * (
-        n_x[1:-1, 2:] - n_x[1:-1, :-2] + n_y[:-2, 1:-1] - n_y[2:, 1:-1])
-    if min(out.shape) > 2:
-        out[0], out[-1], out[:, 0], out[:, -1] = out[1], out[-2], out[:, 1], out[:, -2]
-    out[~valid] = np.nan
+    for_bands(len(out), BAND, lambda i, j: _curvature_rows(n_x, n_y, valid, scale, i, j, out))
     return out
 
 
@@ -104,7 +92,7 @@ def relief(
                                      interpolation=cv2.INTER_LINEAR), np.float32)
         np.multiply(mean, trust, out=mean)
         weighted -= mean
-    return solve_poisson(divergence(flat_u, flat_v), short_px, pole_px=long_px)
+    return poisson(flat_u, flat_v, short_px, pole_px=long_px)
 
 
 def shape_image(
@@ -133,17 +121,6 @@ def shape_image(
     return out
 
 
-def band_passed(du: NDArray[np.float32], dv: NDArray[np.float32], short_px: float, long_px: float
-                ) -> NDArray[np.float32]:
-    """Integrate gradients and keep the form between two Gaussian filters, in one solution.
-
-    :param du, dv: (H, W) gradients along columns and rows per pixel, NaN counts as 0.
-    :param short_px: sigma below which form is smoothed away; 0 for none.
-    :param long_px: sigma above which form is flattened away; 0 for none.
-    """
-    return solve_poisson(divergence(du, dv), short_px, long_px)
-
-
 def roughness(
     normal: NDArray[np.float32], du: NDArray[np.float32], dv: NDArray[np.float32], pitch: float,
     metres: float, s_filter: float, l_filter: float,
@@ -170,7 +147,7 @@ def roughness(
     inside &= valid
     if not inside.any():
         return Roughness()
-    height = band_passed(du, dv, short, long)[inside].astype(np.float64) * metres
+    height = poisson(du, dv, short, long)[inside].astype(np.float64) * metres
     height -= height.mean()
     square = np.zeros(height.shape)
     slopes = slope(normal)
@@ -228,6 +205,22 @@ def _slope_rows(normal, out):    # type: ignore[no-untyped-def]
 
 
 @numba.njit(nogil=True, cache=True, error_model='numpy')
+def _curvature_rows(n_x, n_y, valid, scale, first, last, out):    # type: ignore[no-untyped-def]
+    """Divergence across three pixels; a pixel of the border takes its neighbour's."""
+    height, width = out.shape
+    for row in range(first, last):
+        y = min(max(row, 1), height - 2)
+        for column in range(width):
+            x = min(max(column, 1), width - 2)
+            known = (valid[row, column] and valid[y, x - 1] and valid[y, x + 1]
+                     and valid[y - 1, x] and valid[y + 1, x])
+            # rows count downwards, y upwards
+            out[row, column] = scale * (
+                n_x[y, x + 1] - n_x[y, x - 1] + n_y[y - 1, x] - n_y[y + 1, x]
+            ) if known else np.float32(np.nan)
+
+
+@numba.njit(nogil=True, cache=True, error_model='numpy')
 def _grey_rows(relief, valid, middle, gain, out):    # type: ignore[no-untyped-def]
     rows, width = relief.shape
     for y in range(rows):
@@ -243,13 +236,12 @@ def _grey_rows(relief, valid, middle, gain, out):    # type: ignore[no-untyped-d
 def _weigh_rows(du, dv, light, dark, trust, out_u, out_v):    # type: ignore[no-untyped-def]
     """Trust in the slopes of pixels of some brightness, and the slopes times it."""
     rows, width = du.shape
+    zero = np.float32(0)
     for y in range(rows):
         for x in range(width):
             square = light[y, x] * light[y, x]
             share = square / (square + dark)
-            if np.isnan(share) or np.isnan(du[y, x]) or np.isnan(dv[y, x]):
-                trust[y, x] = out_u[y, x] = out_v[y, x] = np.float32(0)
-            else:
-                trust[y, x] = share
-                out_u[y, x] = share * du[y, x]
-                out_v[y, x] = share * dv[y, x]
+            known = share == share and du[y, x] == du[y, x] and dv[y, x] == dv[y, x]
+            trust[y, x] = share if known else zero
+            out_u[y, x] = share * du[y, x] if known else zero
+            out_v[y, x] = share * dv[y, x] if known else zero

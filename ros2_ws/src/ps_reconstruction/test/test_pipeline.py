@@ -12,7 +12,7 @@ from ps_head_driver.head_model import CameraGeometry, load_head, nominal_head_pa
 from ps_head_driver.kinematics import lights_at
 from ps_head_driver.stack import Light, Panel, Plane, Stack, angular_error_deg
 from ps_reconstruction.near_field import photometric_problem
-from ps_reconstruction.pipeline import METHODS, OUTPUTS, Options, reconstruct
+from ps_reconstruction.pipeline import METHODS, OUTPUTS, Options, Reconstruction, reconstruct
 from ps_reconstruction.problem import SATURATED, expand
 
 
@@ -148,6 +148,22 @@ def test_only_what_is_asked_for_is_computed(render: Callable) -> None:
         assert getattr(result, name) is None, name
     assert set(result.timings) == {'lights', 'normals', 'slope'}
     assert reconstruct(stack, outputs=set()).height is None
+
+
+def test_pictures_are_announced_once_each_as_soon_as_they_are_there(render: Callable) -> None:
+    stack, _, _ = render(plate)
+    heard: list[str] = []
+
+    def hear(result: Reconstruction, name: str) -> None:
+        assert getattr(result, name) is not None
+        heard.append(name)
+
+    reconstruct(stack, on_ready=hear)
+    assert sorted(heard) == sorted(set(OUTPUTS) - {'roughness'})
+    assert heard.index('normal') < heard.index('height')
+    heard.clear()
+    reconstruct(stack, outputs={'shape'}, on_ready=hear)
+    assert heard == ['shape']
 
 
 def test_cameras_with_fewer_bits_than_the_pixel_type(render: Callable) -> None:

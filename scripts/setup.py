@@ -320,6 +320,9 @@ def build_environment(ros: Path | None) -> dict[str, str]:
     environment = clean_environment(ros)
     environment['PATH'] = f'{VENV / "bin"}{os.pathsep}{environment["PATH"]}'
     environment['VIRTUAL_ENV'] = str(VENV)
+    # Else colcon adds a load limit, which makes the build serial on a machine that has other work;
+    # what a calling make says there is for its own children only.
+    environment['MAKEFLAGS'] = f'-j{len(os.sched_getaffinity(0))}'
     if not ros:
         environment['AMENT_PREFIX_PATH'] = environment['CMAKE_PREFIX_PATH'] = str(VENV)
     else:

@@ -17,16 +17,16 @@ def run(path: Path) -> None:
 
 
 def main() -> int:
-    """Run the benchmarks named on the command line, all without one; 1 if a name fits none."""
-    wanted = sys.argv[1:]
-    found = sorted(Path(__file__).parent.glob('bench_*.py'))
-    chosen = [path for path in found if not wanted or path.stem.removeprefix('bench_') in wanted]
-    if not chosen:
-        names = ', '.join(path.stem.removeprefix('bench_') for path in found)
-        print(f'no such benchmark; there are: {names}', file=sys.stderr)
+    """Run the benchmarks named on the command line, all without one; 1 if a name is unknown."""
+    found = {path.stem.removeprefix('bench_'): path
+             for path in sorted(Path(__file__).parent.glob('bench_*.py'))}
+    wanted = sys.argv[1:] or list(found)
+    unknown = [name for name in wanted if name not in found]
+    if unknown:
+        print(f'no benchmark {", ".join(unknown)}; there are: {", ".join(found)}', file=sys.stderr)
         return 1
-    for path in chosen:
-        run(path)
+    for name in wanted:
+        run(found[name])
     return 0
 
 

@@ -186,7 +186,7 @@ def test_command_writes_what_its_arguments_say(tmp_path, capsys):
     (['--head', '/nowhere.yaml'], 'HEAD_BAD_REQUEST: /nowhere.yaml'),
     (['--calibration', '/nowhere.yaml'], 'CALIBRATION_FILE_NOT_FOUND'),
     (['--out', '/nowhere/x.urdf'], '/nowhere/x.urdf'),
-    (['--drawing', '/tmp/x.nonsense'], 'nonsense')])
+    (['--drawing', '/nowhere/x.nonsense'], 'nonsense')])
 def test_command_says_what_is_wrong(capsys, words, said):
     assert main(words) == 1
     message = capsys.readouterr().err

@@ -212,10 +212,12 @@ def test_a_lost_head_is_named(tmp_path, monkeypatch):
         assert never_there.value.code == ErrorCode.SEQUENCER_CAMERA_LOST
         board = Board(path)
         camera.arm([0.004])
-        threading.Timer(0.2, board.close).start()
+        end = threading.Timer(0.2, board.close)
+        end.start()
         with pytest.raises(PsError, match='has gone') as lost:
             camera.collect(1, 30.0)
         assert lost.value.code == ErrorCode.SEQUENCER_CAMERA_LOST
+        end.join()                  # the socket is gone after its clients
         board = Board(path)         # the head is back
         try:
             camera.arm([0.004])

@@ -97,7 +97,8 @@ def solve_equations(equations, pixels):    # type: ignore[no-untyped-def]
 @numba.njit(nogil=True, cache=True)
 def solve_frames(frames, equations, pixels):    # type: ignore[no-untyped-def]
     """Weighted least squares over all frames (T, FRAME_SIZE)."""
-    equations[:] = 0
+    for x in range(EQUATION_SIZE):
+        equations[x] = 0
     for t in range(frames.shape[0]):
         add_equations(frames[t], equations)
     solve_equations(equations, pixels)
@@ -229,19 +230,32 @@ def _find_glossy(frame, index, pixels):    # type: ignore[no-untyped-def]
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def _drop_place(frame, index, pixels, only_bright, margin):    # type: ignore[no-untyped-def]
-    """Drop this frame where it is PLACE.
+def _drop_place(frame, index, pixels):    # type: ignore[no-untyped-def]
+    """Drop this frame where it is PLACE."""
+    for x in range(CHUNK):
+        weight = frame[WEIGHT + x]
+        frame[WEIGHT + x] = np.float32(0) if pixels[PLACE + x] == index else weight
 
-    :param only_bright: only where it exceeds Lambert's law by more than ``margin`` times |g|.
-    """
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def _drop_highlight(frame, index, pixels, margin):    # type: ignore[no-untyped-def]
+    """Drop this frame where it is PLACE and exceeds Lambert's law by more than margin |g|."""
     for x in range(CHUNK):
         predicted = (pixels[G0 + x] * frame[D0 + x] + pixels[G1 + x] * frame[D1 + x]
                      + pixels[G2 + x] * frame[D2 + x])
-        bright = predicted + margin * pixels[LENGTH + x]
-        limit = bright if only_bright else np.float32(-1e30)
         weight = frame[WEIGHT + x]
-        drop = (pixels[PLACE + x] == index) & (frame[U + x] > limit)
+        drop = ((pixels[PLACE + x] == index)
+                & (frame[U + x] > predicted + margin * pixels[LENGTH + x]))
         frame[WEIGHT + x] = np.float32(0) if drop else weight
+
+
+@numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
+def _any_place(pixels):    # type: ignore[no-untyped-def]
+    """Whether a frame is noted as PLACE anywhere in the chunk."""
+    highest = np.float32(-1)
+    for x in range(CHUNK):
+        highest = max(highest, pixels[PLACE + x])
+    return highest >= np.float32(0)
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
@@ -250,7 +264,8 @@ def first_of_few(frames, margin, equations, pixels):    # type: ignore[no-untype
     count = frames.shape[0]
     zero, one = np.float32(0), np.float32(1)
     brightest = np.zeros(CHUNK, np.float32)
-    pixels[LEFT:LEFT + CHUNK] = 0
+    for x in range(CHUNK):
+        pixels[LEFT + x] = zero
     for t in range(count):
         frame = frames[t]
         for x in range(CHUNK):
@@ -263,8 +278,10 @@ def first_of_few(frames, margin, equations, pixels):    # type: ignore[no-untype
             pixels[PLACE + x] = -one
         for t in range(count):
             _find_dark(frames[t], np.float32(t), pixels)
+        if not _any_place(pixels):
+            break
         for t in range(count):
-            _drop_place(frames[t], np.float32(t), pixels, False, zero)
+            _drop_place(frames[t], np.float32(t), pixels)
         for x in range(CHUNK):
             pixels[LEFT + x] -= one if pixels[PLACE + x] >= zero else zero
     solve_frames(frames, equations, pixels)
@@ -275,9 +292,10 @@ def first_of_few(frames, margin, equations, pixels):    # type: ignore[no-untype
         pixels[PLACE + x] = -one
     for t in range(count):
         _find_glossy(frames[t], np.float32(t), pixels)
-    for t in range(count):
-        _drop_place(frames[t], np.float32(t), pixels, True, np.float32(margin))
-    solve_frames(frames, equations, pixels)
+    if _any_place(pixels):
+        for t in range(count):
+            _drop_highlight(frames[t], np.float32(t), pixels, np.float32(margin))
+        solve_frames(frames, equations, pixels)
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
@@ -323,8 +341,9 @@ def estimate(frames, coefficients, margin, rounds, rejecting, reflecting, equati
     :param margin: excess over Lambert's law, relative to |g|, that noise explains.
     """
     for t in range(frames.shape[0]):
-        frames[t, WEIGHT:WEIGHT + CHUNK] = 1
-        frames[t, FACTOR:FACTOR + CHUNK] = 1
+        frame = frames[t]
+        for x in range(CHUNK):
+            frame[WEIGHT + x], frame[FACTOR + x] = 1, 1
     if not rejecting:
         return
     if frames.shape[0] >= MANY:
@@ -332,8 +351,9 @@ def estimate(frames, coefficients, margin, rounds, rejecting, reflecting, equati
     else:
         first_of_few(frames, margin, equations, pixels)
         for t in range(frames.shape[0]):         # what the first test dropped stays dropped
+            frame = frames[t]
             for x in range(CHUNK):
-                frames[t, USABLE + x] = frames[t, WEIGHT + x]
+                frame[USABLE + x] = frame[WEIGHT + x]
     if reflecting:
         refine(frames, coefficients, rounds, equations, pixels)
 

@@ -44,7 +44,7 @@ from ps_reconstruction.stv_samples import (
     view_nodes,
 )
 
-BAND, LEAST_BAND = 48, 16     # rows per band; fewer for many lights, to bound the memory
+BAND, LEAST_BAND = 48, 12     # rows per band; fewer for many lights, to bound the memory
 BAND_FRAMES = 768             # rows times lights of a band
 SAMPLE_BAND = 512             # samples per core and call
 ROUNDS = 5                    # of the reflectance fit

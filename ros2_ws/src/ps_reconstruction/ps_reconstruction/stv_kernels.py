@@ -6,6 +6,7 @@ One function per kernel; a GPU version can replace `solve_pixels`, `combine_patc
 import numba
 import numpy as np
 
+from ps_reconstruction.chunks import count_true, fill, interpolate, store
 from ps_reconstruction.outliers import (
     CHUNK,
     D0,
@@ -76,31 +77,30 @@ def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coeffic
     count, rows, width = values.shape
     # the last chunk of a row leaves the end of these to numbers that nobody reads
     frames = np.empty((count, FRAME_SIZE), np.float32)
-    pixels, system = np.empty(PIXEL_SIZE, np.float32), np.empty(EQUATION_SIZE, np.float32)
+    pixels, system = np.zeros(PIXEL_SIZE, np.float32), np.empty(EQUATION_SIZE, np.float32)
     look, gain = np.empty(3 * CHUNK, np.float32), np.empty(CHUNK, np.float32)
     sums, flags = np.empty(SUMS_SIZE, np.float32), np.empty(CHUNK, np.int32)
-    one = np.float32(1)
     for y in range(rows):
         i = (top + y) // step
         fy = np.float32(top + y - i * step) / np.float32(step)
         for begin in range(0, width, CHUNK):
             end = min(begin + CHUNK, width)
-            n = end - begin
-            if not mask[y, begin:end].any():
+            here = mask[y, begin:end]
+            inside = count_true(here)
+            if inside == 0:
                 continue
-            system[:], sums[:], flags[:], pixels[:] = 0, 0, 0, 0
+            fill(system, np.float32(0))
+            fill(sums, np.float32(0))
+            fill(pixels, np.float32(0))
+            for x in range(CHUNK):
+                flags[x] = 0
             for m in range(3):
                 interpolate(view[m], i, fy, begin, step, look[m * CHUNK:])
             for t in range(count):
                 frame = frames[t]
-                frame[U:U + CHUNK] = 1
-                frame[U:U + n] = values[t, y, begin:end]
-                frame[USABLE:USABLE + CHUNK] = 1
+                load(values[t, y, begin:end], frame)
                 if saturated.size:
-                    for x in range(n):
-                        if saturated[t, y, begin + x]:
-                            frame[USABLE + x] = 0
-                            flags[x] |= np.int32(SATURATED)
+                    exclude(saturated[t, y, begin:end], frame, flags)
                 if flat.size:
                     interpolate(flat[t], i, fy, begin, step, gain)
                     for x in range(CHUNK):
@@ -111,53 +111,67 @@ def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coeffic
                 add_equations(frame, system)
             solve_equations(system, pixels)
             for m in range(3):
-                reference[m, y, begin:end] = pixels[m * CHUNK:m * CHUNK + n]
+                store(pixels[m * CHUNK:], reference[m, y, begin:end])
             estimate(frames, coefficients, margin, rounds, rejecting, reflecting, system, pixels)
-            system[:] = 0
+            fill(system, np.float32(0))
             for t in range(count):
                 judge(frames[t], pixels, sums, flags)
                 add_equations(frames[t], system)
             if shading.size:
                 shade(frames, pixels, shading[:, y, begin:end])
-            for x in range(n):
-                quality[0, y, begin + x] = sums[SQUARES + x] / max(
-                    sums[USED + x] - np.float32(3), one)
-                quality[1, y, begin + x] = sums[LIGHT + x] / np.float32(count)
-                quality[2, y, begin + x] = sums[USED + x]
-                quality[3, y, begin + x] = (sums[MISFIT + x] * pixels[INVERSE + x]
-                                            / np.float32(count))
-                few = np.int32(FEW_LIGHTS) if sums[USED + x] < np.float32(3) else np.int32(0)
-                reason[y, begin + x] = np.uint8(flags[x] | few)
-            if not mask[y, begin:end].all():
-                for x in range(n):
-                    if not mask[y, begin + x]:
-                        for m in range(3):
-                            pixels[m * CHUNK + x] = 0
-                        for m in range(9):
-                            system[m * CHUNK + x] = 0
+            report(sums, flags, pixels, count, quality[:, y, begin:end], reason[y, begin:end])
+            if inside < end - begin:
+                blank(here, 3, pixels)
+                blank(here, 9, system)
             for m in range(3):
-                scaled[m, y, begin:end] = pixels[m * CHUNK:m * CHUNK + n]
+                store(pixels[m * CHUNK:], scaled[m, y, begin:end])
             for m in range(9):
-                equations[m, y, begin:end] = system[m * CHUNK:m * CHUNK + n]
+                store(system[m * CHUNK:], equations[m, y, begin:end])
+
+
+@numba.njit(nogil=True, cache=True)
+def load(values, frame):    # type: ignore[no-untyped-def]
+    """Intensities of a part of a row, all usable."""
+    n = len(values)
+    for x in range(n):
+        frame[U + x] = values[x]
+    for x in range(n, CHUNK):
+        frame[U + x] = 1
+    for x in range(CHUNK):
+        frame[USABLE + x] = 1
+
+
+@numba.njit(nogil=True, cache=True)
+def exclude(saturated, frame, flags):    # type: ignore[no-untyped-def]
+    """Make saturated values unusable."""
+    for x in range(len(saturated)):
+        frame[USABLE + x] = np.float32(1) - np.float32(saturated[x])
+        flags[x] |= np.int32(SATURATED) * np.int32(saturated[x])
+
+
+@numba.njit(nogil=True, cache=True)
+def blank(mask, quantities, buffer):    # type: ignore[no-untyped-def]
+    """Set what lies outside the mask to 0."""
+    for m in range(quantities):
+        for x in range(len(mask)):
+            value = buffer[m * CHUNK + x]
+            buffer[m * CHUNK + x] = value if mask[x] else np.float32(0)
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def interpolate(grid, i, fy, begin, step, out):    # type: ignore[no-untyped-def]
-    """One quantity of the nodes, (gh, gw), along CHUNK pixels of a row below node row i.
-
-    Beyond the last node it is extrapolated: what lies past the picture's edge is read by nobody.
-    """
-    x = 0
-    while x < CHUNK:
-        j = min((begin + x) // step, grid.shape[1] - 2)
-        end = min((j + 1) * step - begin, CHUNK) if j < grid.shape[1] - 2 else CHUNK
-        left = grid[i, j] + fy * (grid[i + 1, j] - grid[i, j])
-        right = grid[i, j + 1] + fy * (grid[i + 1, j + 1] - grid[i, j + 1])
-        slope = (right - left) / np.float32(step)
-        left -= slope * np.float32(j * step - begin)
-        for k in range(x, end):
-            out[k] = left + slope * np.float32(k)
-        x = end
+def report(sums, flags, pixels, count, quality, reason):    # type: ignore[no-untyped-def]
+    """Sums over the frames of a chunk to ``quality`` (4, n) and ``reason`` (n,)."""
+    one, share = np.float32(1), np.float32(1) / np.float32(count)
+    squares, light, used, misfit = quality[0], quality[1], quality[2], quality[3]
+    for x in range(len(reason)):
+        left = sums[USED + x]
+        squares[x] = sums[SQUARES + x] / max(left - np.float32(3), one)
+        light[x] = sums[LIGHT + x] * share
+        used[x] = left
+        misfit[x] = sums[MISFIT + x] * pixels[INVERSE + x] * share
+    for x in range(len(reason)):
+        few = np.int32(FEW_LIGHTS) if sums[USED + x] < np.float32(3) else np.int32(0)
+        reason[x] = np.uint8(flags[x] | few)
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
@@ -247,7 +261,7 @@ def combine_patches(reference, scaled, equations, spatial, edge_sigma, ridge, fi
     # quantity after quantity, SIDE apart. What lies beside the image has no equations.
     ring = 2 * radius + 1
     around = np.empty((ring, 12 * SIDE), np.float32)
-    one = np.float32(1)
+    zero, one = np.float32(0), np.float32(1)
     for begin in range(0, width, CHUNK):
         n = min(CHUNK, width - begin)
         left, right = max(begin - radius, 0), min(begin + CHUNK + radius, width)
@@ -255,24 +269,24 @@ def combine_patches(reference, scaled, equations, spatial, edge_sigma, ridge, fi
         for y in range(-2 * radius, rows):
             here, new = first + y, first + y + radius
             row = around[new % ring]
-            row[:] = 0
-            if 0 <= new < height:
+            if not 0 <= new < height:
+                fill(row, zero)
+            else:
+                if length < SIDE:
+                    fill(row, zero)
                 for m in range(3):
-                    origin = m * SIDE + start
-                    row[origin:origin + length] = scaled[m, new, left:right]
+                    store(scaled[m, new, left:right], row[m * SIDE + start:][:length])
                 for m in range(9):
-                    origin = (3 + m) * SIDE + start
-                    row[origin:origin + length] = equations[m, new, left:right]
+                    store(equations[m, new, left:right], row[(3 + m) * SIDE + start:][:length])
             if y < 0:
                 continue
             for m in range(3):
-                origin = m * SIDE + radius
-                pixels[m * CHUNK:(m + 1) * CHUNK] = around[here % ring, origin:origin + CHUNK]
+                store(around[here % ring, m * SIDE + radius:], pixels[m * CHUNK:][:CHUNK])
             for x in range(CHUNK):
                 g0, g1, g2 = pixels[G0 + x], pixels[G1 + x], pixels[G2 + x]
                 near[x] = one / (np.float32(edge_sigma * edge_sigma)
                                  * (g0 * g0 + g1 * g1 + g2 * g2) + np.float32(1e-30))
-            system[:] = 0
+            fill(system, zero)
             for dy in range(ring):
                 add_neighbours(around[(here + dy - radius) % ring], spatial[dy], near, pixels,
                                system)
@@ -288,7 +302,7 @@ def combine_patches(reference, scaled, equations, spatial, edge_sigma, ridge, fi
                     system[(6 + m) * CHUNK + x] += near[x] * reference[m, here, begin + x]
             solve_equations(system, pixels)
             for m in range(3):
-                solved[m, y, begin:begin + n] = pixels[m * CHUNK:m * CHUNK + n]
+                store(pixels[m * CHUNK:], solved[m, y, begin:begin + n])
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')

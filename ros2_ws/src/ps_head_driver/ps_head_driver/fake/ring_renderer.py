@@ -23,8 +23,10 @@ from ps_head_driver.head_model import HeadModel
 from ps_head_driver.kinematics import PanelPose
 from ps_head_driver.stack import Truth
 
-#: Emitters along a panel's width and height, where nothing can stand in the way and elsewhere.
-_FREE, _SHADOWED = (6, 4), (32, 16)
+_FREE = (6, 4)              # emitters along a panel's width and height where no shadow falls
+# and elsewhere, on a lattice of two neighbours of Fibonacci's: no edge, however it lies, hides
+# whole rows of it at once, as it would of a grid along the sides of the panel
+_SHADOWED, _TURN = 610, 377
 _PROBES = (7, 5)            # on its edges and inside: where all are free, nothing is in the way
 
 
@@ -252,10 +254,11 @@ def _emission(point, dx, dy, dz, axis, lobe):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(cache=True, parallel=True)
-def _light(points, free, probes, shadowed, part, axis, lobe, ring, ends, slits):  # type: ignore[no-untyped-def]
+def _light(points, free, probes, shadowed, corner, sides, axis, lobe, ring, ends, slits):  # type: ignore[no-untyped-def]
     """Irradiance of each point under one panel, all in the target frame.
 
-    :param part: (2, 3) sides of the part of the panel that one of the ``shadowed`` stands for.
+    :param shadowed: (E, 2) emitters where shadows fall, in fractions of the panel's sides.
+    :param corner: (3,) of the panel, from which its sides (2, 3) run.
     """
     out = np.zeros(points.shape[0], np.float32)
     height = ring[2]
@@ -282,12 +285,16 @@ def _light(points, free, probes, shadowed, part, axis, lobe, ring, ends, slits):
         if near:
             # every pixel looks at other points of the panel (an additive sequence in two
             # dimensions), lest soft shadows become stairs alike in neighbouring pixels
-            a, b = 0.7548776662466927 * k % 1.0 - 0.5, 0.5698402909980532 * k % 1.0 - 0.5
+            a, b = 0.7548776662466927 * k % 1.0, 0.5698402909980532 * k % 1.0
+            cx, cy, cz = corner[0] - x, corner[1] - y, corner[2] - z
             seen = whole = 0.0
             for e in range(shadowed.shape[0]):
-                dx = shadowed[e, 0] + a * part[0, 0] + b * part[1, 0] - x
-                dy = shadowed[e, 1] + a * part[0, 1] + b * part[1, 1] - y
-                dz = shadowed[e, 2] + a * part[0, 2] + b * part[1, 2] - z
+                u, v = shadowed[e, 0] + a, shadowed[e, 1] + b
+                u -= u >= 1.0
+                v -= v >= 1.0
+                dx = cx + u * sides[0, 0] + v * sides[1, 0]
+                dy = cy + u * sides[0, 1] + v * sides[1, 1]
+                dz = cz + u * sides[0, 2] + v * sides[1, 2]
                 light = _emission(points[k], dx, dy, dz, axis, lobe)
                 whole += light
                 s = (height - z) / dz
@@ -350,23 +357,21 @@ class RingRenderer(Renderer):
     def _irradiance(self, points: NDArray, pose: PanelPose) -> NDArray:
         """Irradiance of points in the target frame under a panel of unit radiance, (N,)."""
         where = self._where
-
-        def seen(count: tuple[int, int], gauss: bool) -> NDArray:
-            samples = emitters(pose, count, gauss)[0]
-            samples[:, :3] = (samples[:, :3] - where.position) @ where.rotation
-            return samples
-
-        u, v = np.meshgrid(*(np.linspace(-side / 2, side / 2, count)
-                             for side, count in zip(pose.size, _PROBES, strict=True)))
-        probes = (pose.center + u[..., None] * pose.right
-                  + v[..., None] * np.cross(pose.axis, pose.right)).reshape(-1, 3)
-        part = np.stack([pose.size[0] / _SHADOWED[0] * pose.right,
-                         pose.size[1] / _SHADOWED[1] * np.cross(pose.axis, pose.right)])
+        free = emitters(pose, _FREE, gauss=True)[0]
+        free[:, :3] = (free[:, :3] - where.position) @ where.rotation
+        sides = np.stack([pose.size[0] * pose.right,
+                          pose.size[1] * np.cross(pose.axis, pose.right)])
+        corner = pose.center - sides.sum(axis=0) / 2
+        u, v = (grid.ravel() for grid in np.meshgrid(*(np.linspace(0, 1, n) for n in _PROBES)))
+        probes = corner + np.stack([u, v], axis=1) @ sides
+        e = np.arange(_SHADOWED)
+        lattice = np.stack([e, _TURN * e % _SHADOWED], axis=1) / _SHADOWED
         with KERNEL_LOCK:
             return np.asarray(_light(
-                points, seen(_FREE, True), (probes - where.position) @ where.rotation,
-                seen(_SHADOWED, False), part @ where.rotation, pose.axis @ where.rotation,
-                pose.lobe_exponent, self._ring, self._ends, self._slits))
+                points, free, (probes - where.position) @ where.rotation, lattice,
+                (corner - where.position) @ where.rotation, sides @ where.rotation,
+                pose.axis @ where.rotation, pose.lobe_exponent, self._ring, self._ends,
+                self._slits))
 
     def capture(self, tilt: float, exposure: float = 1.0) -> list[NDArray]:
         """The six pictures of a calibration: E, N, W, S, ALL at a quarter exposure, NONE.

@@ -6,7 +6,8 @@ darker 60 %, because gloss and light from neighbours only ever add.
 Few lights: the residual alone cannot tell a highlight from the attached shadow opposite, so drop
 frames that are dark against the brightest (attached shadow), then the frame whose half-vector
 comes closest to the normal, if that is close and the frame is brighter than noise explains
-(highlight): rejected by chance alone, bright frames would flatten every slope.
+(highlight), at the pixel or in the mean of NEAR side by side: rejected by chance alone, bright
+frames would flatten every slope.
 `refine` then repeats the rejection against the object's own reflectance (reflectance.py).
 
 CHUNK pixels are worked on together. Their numbers lie in flat float32 buffers, quantity after
@@ -27,6 +28,8 @@ LEAST_COSINE = 0.1                        # to a light; below it a frame counts 
 LEAST_RATIO, MOST_RATIO = 0.6, 1.5        # observation over prediction
 DARK_RATIO = 0.1                          # of the brightest frame; darker is an attached shadow
 GATE = float(np.cos(np.radians(25)))      # half-vector against normal: there gloss shows
+NEAR = 5                                  # pixels side by side that a highlight is tested with
+MOST_EXCESS = 0.1                         # of |g|, that one of them counts
 HUBER = 0.02                              # threshold of the residual, relative to |g|
 SINGULAR = 1e-7                           # determinant over cubed trace
 FAST = {'contract', 'reassoc', 'arcp', 'nsz', 'afn'}    # without nnan: NaN marks invalid pixels
@@ -238,14 +241,28 @@ def _drop_place(frame, index, pixels):    # type: ignore[no-untyped-def]
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def _drop_highlight(frame, index, pixels, margin):    # type: ignore[no-untyped-def]
-    """Drop this frame where it is PLACE and exceeds Lambert's law by more than margin |g|."""
+def _drop_highlight(frame, index, pixels, margins, excess):    # type: ignore[no-untyped-def]
+    """Drop this frame where it is PLACE and exceeds Lambert's law by more than noise explains.
+
+    :param margins: (2,) of the excess relative to |g|: of the pixel, of the mean of NEAR pixels
+        side by side, in which noise is lower.
+    :param excess: (CHUNK + NEAR - 1,) scratch, 0 at both ends.
+    """
+    alone, together = margins[0], margins[1]
     for x in range(CHUNK):
         predicted = (pixels[G0 + x] * frame[D0 + x] + pixels[G1 + x] * frame[D1 + x]
                      + pixels[G2 + x] * frame[D2 + x])
-        weight = frame[WEIGHT + x]
+        over = (frame[U + x] - predicted) * pixels[INVERSE + x]
+        believed = frame[WEIGHT + x] > np.float32(0)
+        excess[NEAR // 2 + x] = over if believed else np.float32(0)
+    for x in range(CHUNK):
+        mean = np.float32(0)
+        for k in range(NEAR):
+            mean += min(max(excess[x + k], np.float32(-MOST_EXCESS)), np.float32(MOST_EXCESS))
+        mean *= np.float32(1 / NEAR)
+        weight, own = frame[WEIGHT + x], excess[NEAR // 2 + x]
         drop = ((pixels[PLACE + x] == index)
-                & (frame[U + x] > predicted + margin * pixels[LENGTH + x]))
+                & ((own > alone) | ((mean > together) & (own > np.float32(0)))))
         frame[WEIGHT + x] = np.float32(0) if drop else weight
 
 
@@ -259,7 +276,7 @@ def _any_place(pixels):    # type: ignore[no-untyped-def]
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def first_of_few(frames, margin, equations, pixels):    # type: ignore[no-untyped-def]
+def first_of_few(frames, margins, equations, pixels):    # type: ignore[no-untyped-def]
     """First estimate from few lights: weights 0 or 1 and scaled normals."""
     count = frames.shape[0]
     zero, one = np.float32(0), np.float32(1)
@@ -293,8 +310,9 @@ def first_of_few(frames, margin, equations, pixels):    # type: ignore[no-untype
     for t in range(count):
         _find_glossy(frames[t], np.float32(t), pixels)
     if _any_place(pixels):
+        excess = np.zeros(CHUNK + NEAR - 1, np.float32)
         for t in range(count):
-            _drop_highlight(frames[t], np.float32(t), pixels, np.float32(margin))
+            _drop_highlight(frames[t], np.float32(t), pixels, margins, excess)
         solve_frames(frames, equations, pixels)
 
 
@@ -333,12 +351,13 @@ def refine(frames, coefficients, rounds, equations, pixels):    # type: ignore[n
 
 
 @numba.njit(nogil=True, cache=True)
-def estimate(frames, coefficients, margin, rounds, rejecting, reflecting, equations, pixels):    # type: ignore[no-untyped-def]
+def estimate(frames, coefficients, margins, rounds, rejecting, reflecting, equations, pixels):    # type: ignore[no-untyped-def]
     """Robust scaled normals of a chunk: ``pixels`` hold LS on entry and the estimate on return.
 
     :param frames: (T, FRAME_SIZE), U to USABLE filled; returns WEIGHT and FACTOR.
     :param coefficients: (10,) float32 of the reflectance, for ``reflecting``.
-    :param margin: excess over Lambert's law, relative to |g|, that noise explains.
+    :param margins: (2,) excess over Lambert's law, relative to |g|, that noise explains: of a
+        pixel, of the mean of NEAR pixels.
     """
     for t in range(frames.shape[0]):
         frame = frames[t]
@@ -349,7 +368,7 @@ def estimate(frames, coefficients, margin, rounds, rejecting, reflecting, equati
     if frames.shape[0] >= MANY:
         first_of_many(frames, equations, pixels)
     else:
-        first_of_few(frames, margin, equations, pixels)
+        first_of_few(frames, margins, equations, pixels)
         for t in range(frames.shape[0]):         # what the first test dropped stays dropped
             frame = frames[t]
             for x in range(CHUNK):
@@ -359,9 +378,12 @@ def estimate(frames, coefficients, margin, rounds, rejecting, reflecting, equati
 
 
 @numba.njit(nogil=True, cache=True)
-def estimate_samples(u, d, h, usable, coefficients, margin, rounds, rejecting, reflecting, g,    # type: ignore[no-untyped-def]
+def estimate_samples(u, d, h, usable, coefficients, margins, rounds, rejecting, reflecting, g,    # type: ignore[no-untyped-def]
                      first, last):
-    """`estimate` for samples ``first`` to ``last``: u, usable (T, P), d, h (T, 3, P), g (3, P)."""
+    """`estimate` for samples ``first`` to ``last``: u, usable (T, P), d, h (T, 3, P), g (3, P).
+
+    Samples have no neighbours: ``margins[1]`` must be infinite.
+    """
     count = len(u)
     frames = np.empty((count, FRAME_SIZE), np.float32)
     equations, pixels = np.empty(EQUATION_SIZE, np.float32), np.empty(PIXEL_SIZE, np.float32)
@@ -376,7 +398,7 @@ def estimate_samples(u, d, h, usable, coefficients, margin, rounds, rejecting, r
                     frame[H0 + m * CHUNK + x] = h[t, m, p]
             for m in range(3):
                 pixels[m * CHUNK + x] = g[m, p]
-        estimate(frames, coefficients, margin, rounds, rejecting, reflecting, equations, pixels)
+        estimate(frames, coefficients, margins, rounds, rejecting, reflecting, equations, pixels)
         for x in range(min(CHUNK, last - begin)):
             for m in range(3):
                 g[m, begin + x] = pixels[m * CHUNK + x]

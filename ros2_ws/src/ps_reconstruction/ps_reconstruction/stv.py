@@ -31,6 +31,7 @@ from ps_reconstruction.outliers import (
     LEAST_RATIO,
     MANY,
     MOST_RATIO,
+    NEAR,
     estimate_samples,
 )
 from ps_reconstruction.problem import GREY_WEIGHTS, MAX_PATCH, Problem, Solution
@@ -103,6 +104,7 @@ class Plan:
 
     :param scatter: expected relative error of a pixel's own scaled normal.
     :param margin: excess over Lambert's law, relative to |g|, that noise explains.
+    :param shared_margin: likewise, of the mean of NEAR pixels side by side.
     :param hold: share of the LS normal added to the robust unit normal, 1 where many frames are
         explained badly: then neither is right and their errors partly cancel.
     """
@@ -112,6 +114,7 @@ class Plan:
     scatter: float = 0.0
     hold: float = 0.0
     margin: float = 0.0
+    shared_margin: float = float('inf')
 
 
 def solve(problem: Problem, options: StvOptions | None = None, quality: bool = True,
@@ -130,6 +133,7 @@ def solve(problem: Problem, options: StvOptions | None = None, quality: bool = T
     decided = decided or plan(problem, options)
     reject, reflect = decided.trust > Trust.LEAST_SQUARES, decided.trust == Trust.REFLECTANCE
     coefficients = decided.coefficients.astype(np.float32)
+    margins = np.array([decided.margin, decided.shared_margin], np.float32)
     lights = _planes(problem.lights)
     view = _planes(view_nodes(problem))
     flat = (np.zeros((0, 0, 0), np.float32) if problem.reciprocal_flat is None
@@ -153,8 +157,8 @@ def solve(problem: Problem, options: StvOptions | None = None, quality: bool = T
         tally = np.zeros((4, *shape), np.float32)
         reason = np.zeros(shape, np.uint8)
         solve_band(grey, saturated, mask, lights, view, flat, problem.step, top, coefficients,
-                   decided.margin, options.rounds, reject, reflect, reference, scaled, equations,
-                   shading, tally, reason)
+                   margins, options.rounds, reject, reflect, reference, scaled, equations, shading,
+                   tally, reason)
         inner = slice(first - top, last - top)
         if not reject:
             solved = reference[:, inner]
@@ -201,7 +205,7 @@ def plan(problem: Problem, options: StvOptions | None = None) -> Plan:
     lambertian = np.zeros(reflectance.TERMS)
     if problem.count == 3 or u.shape[1] == 0:
         return Plan(lambertian, Trust.LEAST_SQUARES)
-    margin, alone = 0.0, False
+    margin, shared, alone = 0.0, float('inf'), False
     if problem.count < MANY:
         noise, spread = noise_of(problem, *pixels), spread_of(residuals(u, d, g_ls))
         alone = spread < NOISE_ALONE * noise
@@ -210,12 +214,16 @@ def plan(problem: Problem, options: StvOptions | None = None) -> Plan:
         # (Chang, Yu and Vetterli, 2000).
         gloss = max(spread ** 2 - noise ** 2, 1e-20) ** 0.5
         margin = noise * min(SIGNIFICANT, noise / gloss)
+        # of the mean of neighbours noise is less, what the surface does is not
+        less = noise / NEAR ** 0.5
+        shared = less * (SIGNIFICANT if alone else min(SIGNIFICANT, less / gloss))
 
     def estimated(coefficients: NDArray, trust: Trust) -> NDArray[np.float32]:
         g = g_ls.copy()
         single = coefficients.astype(np.float32)
+        margins = np.array([margin, np.inf], np.float32)
         for_bands(g.shape[1], SAMPLE_BAND, lambda first, last: estimate_samples(
-            u, d, h, usable, single, margin, options.rounds, trust > Trust.LEAST_SQUARES,
+            u, d, h, usable, single, margins, options.rounds, trust > Trust.LEAST_SQUARES,
             trust == Trust.REFLECTANCE, g, first, last))
         return g
 
@@ -256,7 +264,7 @@ def plan(problem: Problem, options: StvOptions | None = None) -> Plan:
         low, high = DOUBTFUL
         hold = float(np.clip((middle[trust] - low) / (high - low), 0, 1))
     return Plan(coefficients, trust, max(level[trust] * (4 / problem.count) ** 0.5, 1e-4), hold,
-                margin)
+                margin, shared)
 
 
 def _misfit(u: NDArray, d: NDArray, h: NDArray, g: NDArray, coefficients: NDArray) -> NDArray:

@@ -55,7 +55,7 @@ SIDE = CHUNK + MAX_PATCH - 1                # of a chunk with its neighbours
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coefficients, margin,    # type: ignore[no-untyped-def]
+def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coefficients, margins,    # type: ignore[no-untyped-def]
                  rounds, rejecting, reflecting, reference, scaled, equations, shading, quality,
                  reason):
     """Temporal weights, own estimate and normal equations of every pixel of a band.
@@ -65,7 +65,8 @@ def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coeffic
     :param mask: (h, W) bool.
     :param lights: (T, 3, gh, gw) at the nodes; view: (3, gh, gw); flat: (T, gh, gw) reciprocal
         flat field, or of size 0. ``top`` is the image row of the band's first row.
-    :param margin: excess over Lambert's law, relative to |g|, that noise explains.
+    :param margins: (2,) excess over Lambert's law, relative to |g|, that noise explains: of a
+        pixel, of the mean of some side by side.
     :param reference: (3, h, W) out, least squares.
     :param scaled: (3, h, W) out, the pixel's own robust estimate; 0 where there is none.
     :param equations: (9, h, W) out, xx xy xz yy yz zz of the matrix and the right side.
@@ -98,7 +99,7 @@ def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coeffic
                 interpolate(view[m], i, fy, begin, step, look[m * CHUNK:])
             for t in range(count):
                 frame = frames[t]
-                load(values[t, y, begin:end], frame)
+                load(values[t, y, begin:end], here, frame)
                 if saturated.size:
                     exclude(saturated[t, y, begin:end], frame, flags)
                 if flat.size:
@@ -112,7 +113,7 @@ def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coeffic
             solve_equations(system, pixels)
             for m in range(3):
                 store(pixels[m * CHUNK:], reference[m, y, begin:end])
-            estimate(frames, coefficients, margin, rounds, rejecting, reflecting, system, pixels)
+            estimate(frames, coefficients, margins, rounds, rejecting, reflecting, system, pixels)
             fill(system, np.float32(0))
             for t in range(count):
                 judge(frames[t], pixels, sums, flags)
@@ -130,22 +131,22 @@ def solve_pixels(values, saturated, mask, lights, view, flat, step, top, coeffic
 
 
 @numba.njit(nogil=True, cache=True)
-def load(values, frame):    # type: ignore[no-untyped-def]
-    """Intensities of a part of a row, all usable."""
+def load(values, mask, frame):    # type: ignore[no-untyped-def]
+    """Intensities of a part of a row, usable within the mask."""
     n = len(values)
     for x in range(n):
         frame[U + x] = values[x]
+        frame[USABLE + x] = np.float32(mask[x])
     for x in range(n, CHUNK):
-        frame[U + x] = 1
-    for x in range(CHUNK):
-        frame[USABLE + x] = 1
+        frame[U + x], frame[USABLE + x] = 1, 0
 
 
 @numba.njit(nogil=True, cache=True)
 def exclude(saturated, frame, flags):    # type: ignore[no-untyped-def]
     """Make saturated values unusable."""
     for x in range(len(saturated)):
-        frame[USABLE + x] = np.float32(1) - np.float32(saturated[x])
+        usable = frame[USABLE + x]
+        frame[USABLE + x] = np.float32(0) if saturated[x] else usable
         flags[x] |= np.int32(SATURATED) * np.int32(saturated[x])
 
 

@@ -3,7 +3,8 @@
 Pixel by pixel, frame by frame, in float64. Written to be read, not to be fast; some thousand times
 slower than `stv.solve`. It differs where the compiled version shares work: here the Huber weights
 of a neighbour q are evaluated for the normal of the patch's own pixel p, pair (p, q) by pair, and
-iterated, as Eq. 6 has it; there once per pixel q, for its own normal.
+iterated, as Eq. 6 has it; there once per pixel q, for its own normal. The compiled version also
+cuts the mean excess over NEAR pixels at the edges of its chunks of CHUNK pixels.
 """
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,9 @@ from ps_reconstruction.outliers import (
     LEAST_KEPT,
     LEAST_RATIO,
     MANY,
+    MOST_EXCESS,
     MOST_RATIO,
+    NEAR,
     RANKS,
 )
 from ps_reconstruction.problem import Problem, expand, intensities
@@ -50,12 +53,13 @@ def solve(problem: Problem, options: StvOptions | None = None,
     own = reference.copy()
     kept = np.zeros(intensity.shape, np.bool_)      # w_temp
     effective = light.copy()                        # f s
+    shared = _shared_excess(intensity / irradiance, direction, usable & mask[..., None])
     for y, x in np.argwhere(mask):
         if intensity[y, x].sum() > 0:
             reference[y, x] = _fit(light[y, x], intensity[y, x], np.ones(problem.count))
             own[y, x], kept[y, x], factor = pixel(
                 intensity[y, x] / irradiance[y, x], direction[y, x], half[y, x], usable[y, x],
-                reference[y, x], decided, options.rounds)
+                reference[y, x], decided, options.rounds, shared[y, x])
             effective[y, x] *= factor[:, None]
     if decided.trust == Trust.LEAST_SQUARES:
         return reference
@@ -70,17 +74,18 @@ def solve(problem: Problem, options: StvOptions | None = None,
 
 
 def pixel(u: NDArray, d: NDArray, h: NDArray, usable: NDArray, g: NDArray, decided: Plan,
-          rounds: int) -> tuple[NDArray, NDArray, NDArray]:
+          rounds: int, shared: NDArray | None = None) -> tuple[NDArray, NDArray, NDArray]:
     """Temporal rejection at one pixel: its own scaled normal, w_temp (T,) and f / (n.l) (T,).
 
     :param u: (T,) intensity per irradiance; d, h: (T, 3) directions and half-vectors.
     :param g: (3,) least squares.
+    :param shared: (T,) mean excess over Lambert's law of NEAR pixels; only for few lights.
     """
     if decided.trust == Trust.LEAST_SQUARES:
         return g, np.ones(len(u), np.bool_), np.ones(len(u))
     factor = np.ones(len(u))
     g, keep = _first_of_many(u, d, usable) if len(u) >= MANY else _first_of_few(
-        u, d, h, usable, decided.margin)
+        u, d, h, usable, decided, shared)
     if decided.trust == Trust.REFLECTANCE:
         if len(u) < MANY:
             usable = keep
@@ -105,22 +110,46 @@ def _first_of_many(u: NDArray, d: NDArray, usable: NDArray) -> tuple[NDArray, ND
     return g, keep
 
 
-def _first_of_few(u: NDArray, d: NDArray, h: NDArray, usable: NDArray, margin: float
-                  ) -> tuple[NDArray, NDArray]:
+def _first_of_few(u: NDArray, d: NDArray, h: NDArray, usable: NDArray, decided: Plan,
+                  shared: NDArray | None) -> tuple[NDArray, NDArray]:
+    g, keep = _without_dark(u, d, usable)
+    if keep.sum() > 3:
+        cosine = np.where(keep, h @ g / np.linalg.norm(g), -1)
+        glossy = np.argmax(cosine)
+        excess = (u[glossy] - d[glossy] @ g) / np.linalg.norm(g)
+        together = shared is not None and excess > 0 and shared[glossy] > decided.shared_margin
+        if cosine[glossy] > GATE and (excess > decided.margin or together):
+            keep[glossy] = False
+            g = _fit(d, u, keep, g)
+    return g, keep
+
+
+def _without_dark(u: NDArray, d: NDArray, usable: NDArray) -> tuple[NDArray, NDArray]:
+    """Drop attached shadows, as long as more than three frames are left."""
     keep = usable.copy()
     while keep.sum() > 3:
         darkest = np.flatnonzero(keep)[np.argmin(u[keep])]
         if u[darkest] >= DARK_RATIO * u.max():
             break
         keep[darkest] = False
-    g = _fit(d, u, keep)
-    if keep.sum() > 3:
-        cosine = np.where(keep, h @ g / np.linalg.norm(g), -1)
-        glossy = np.argmax(cosine)
-        if cosine[glossy] > GATE and u[glossy] > d[glossy] @ g + margin * np.linalg.norm(g):
-            keep[glossy] = False
-            g = _fit(d, u, keep, g)
-    return g, keep
+    return _fit(d, u, keep), keep
+
+
+def _shared_excess(u: NDArray, d: NDArray, usable: NDArray) -> NDArray[np.float64]:
+    """Mean over NEAR pixels of a row of the excess over Lambert's law relative to |g|, (H, W, T).
+
+    Frames that are not believed count 0, and so does what lies beside the picture.
+    """
+    excess = np.zeros(u.shape)
+    if u.shape[-1] < MANY:
+        for y, x in np.argwhere(usable.sum(axis=-1) >= 3):
+            g, keep = _without_dark(u[y, x], d[y, x], usable[y, x])
+            length = np.linalg.norm(g)
+            if length > 0:
+                excess[y, x] = keep * (u[y, x] - d[y, x] @ g) / length
+    padded = np.pad(np.clip(excess, -MOST_EXCESS, MOST_EXCESS), [(0, 0), (NEAR // 2,) * 2, (0, 0)])
+    windows: NDArray = np.lib.stride_tricks.sliding_window_view(padded, NEAR, axis=1)
+    return np.asarray(windows.mean(axis=-1))
 
 
 def _compare(u: NDArray, d: NDArray, h: NDArray, usable: NDArray, g: NDArray, decided: Plan

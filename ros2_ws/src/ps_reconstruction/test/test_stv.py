@@ -97,7 +97,7 @@ def test_without_patches_equals_the_oracle_pixel_by_pixel(trust: Trust) -> None:
 
 
 def test_what_noise_explains_is_no_highlight_here_nor_in_the_oracle() -> None:
-    normal, mask = sphere(96, limit=0.4)
+    normal, mask = sphere(64, limit=0.6)
     problem = render(normal, mask, lights_of(4), noise=0.01)
     options = StvOptions(patch=1, ridge=0.0)
     decided = stv.plan(problem, options)
@@ -112,6 +112,22 @@ def test_what_noise_explains_is_no_highlight_here_nor_in_the_oracle() -> None:
     assert same.mean() > 0.98
     eager = stv.solve(problem, options, decided=dataclasses.replace(decided, margin=0.0))
     assert (errors(eager.normal, plain.normal.astype(float), mask) < 0.01).mean() < 0.6
+
+
+def test_gloss_below_the_noise_of_a_pixel_is_found_in_neighbours() -> None:
+    normal, mask = sphere(64, limit=0.6)
+    problem = render(normal, mask, lights_of(4), gloss=0.05, noise=0.01)
+    options = StvOptions(patch=1, ridge=0.0, trust=Trust.REJECTION)
+    decided = stv.plan(problem, options)
+    assert decided.shared_margin < 0.5 * decided.margin
+    alone = dataclasses.replace(decided, shared_margin=float('inf'))
+    together, single, plain = (errors(solution.normal, normal, mask).mean() for solution in (
+        stv.solve(problem, options, decided=decided), stv.solve(problem, options, decided=alone),
+        least_squares.solve(problem)))
+    assert together < single < plain
+    g = stv_oracle.solve(problem, options, decided)
+    same = np.abs(scaled(stv.solve(problem, options, decided=decided)) - g)[mask].max(axis=-1)
+    assert (same < 1e-4).mean() > 0.99
 
 
 def test_the_solution_lowers_the_objective_of_equation_6() -> None:

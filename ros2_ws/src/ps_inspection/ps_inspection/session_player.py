@@ -14,7 +14,9 @@ from ps_reconstruction import cdr
 from ps_reconstruction.session_format import TOPICS, Topic
 from ps_reconstruction.session_reader import Message, Scan, Session
 
-SETTLED = 0.5       # s without a new reader after which all are taken to be there
+# s without a new reader after which all are taken to be there: some periods of the announcements
+# in fastdds.xml; also what a reader needs that was found and has not found the player yet
+SETTLED = 1.5
 # what live nodes would say about the played stacks themselves
 DERIVED = ('ps_interfaces/msg/ReconstructionInfo', 'diagnostic_msgs/msg/DiagnosticArray')
 
@@ -36,7 +38,7 @@ class PlayOptions:
     loop: bool = False
     everything: bool = False
     namespace: str = ''
-    wait: float = 3.0
+    wait: float = 8.0
 
 
 class Player:

@@ -120,7 +120,11 @@ def batch(source: str, first: int, count: int) -> tuple[Counter[str], list[str],
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_LIMIT, MEMORY_LIMIT))
     mutator = Mutator(Path(source))
     with tempfile.TemporaryDirectory(prefix='ps_fuzz_', dir=Path(source).parent) as folder:
-        warm_up()       # the compiler's cache is no change outside, nor the attack's memory
+        # the compiler's cache is no change outside, nor the attack's memory; colour compiles other
+        # kernels than grey pictures, as small ones do than large ones
+        warm_up()
+        for message in Session(Path(source)).stacks():
+            reconstruct(message_to_stack(message))
         attack(mutator, 0, Path(folder))
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
         kinds: Counter[str] = Counter()

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ps_calibration.ring_pictures import stated_tilt
 from ps_head_driver.calibration_file import HeadCalibration, apply
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import HeadModel
@@ -78,7 +79,7 @@ def relit(stack: Stack, head: HeadModel, calibration: HeadCalibration | None) ->
     for light in frames.lights:
         is_bright = light.mode == Mode.BRIGHT_FIELD
         angle = (float(bright.tilt(light.motor_counts)) if is_bright and light.motor_counts
-                 else math.acos(min(max(-light.axis[2], -1.0), 1.0)))
+                 else stated_tilt(light))
         panel = (bright if is_bright else dark).ring.pose(light.panel.name, angle)  # type: ignore
         now = as_light(panel)
         lights.append(replace(light, position=now.position, axis=now.axis, right=now.right,

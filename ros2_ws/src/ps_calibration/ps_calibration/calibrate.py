@@ -4,11 +4,13 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 import importlib.metadata
 from itertools import pairwise
+import math
 import time
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ps_calibration.dark_field import DarkField, calibrate_dark_field
 from ps_calibration.ring_fit import (
     RingFit,
     blocked_slits,
@@ -27,7 +29,13 @@ from ps_calibration.ring_target import RingTarget
 from ps_calibration.shares import Shares, measure_shares
 from ps_calibration.target_pose import camera_to_plane
 from ps_calibration.verdict import judge
-from ps_head_driver.calibration_file import HeadCalibration, PanelCorrection, new_calibration_id
+from ps_head_driver.calibration_file import (
+    DarkFieldPanel,
+    DarkFieldRecord,
+    HeadCalibration,
+    PanelCorrection,
+    new_calibration_id,
+)
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import DIRECTIONS, CameraGeometry, HeadModel
 from ps_head_driver.kinematics import BrightFieldKinematics, PanelPose
@@ -43,6 +51,7 @@ class Calibration:
     :param fit: None if it failed before the fit.
     :param z_scale: known height of the wall over the one fitted.
     :param shares: what was fitted, per motor position.
+    :param dark: of the dark-field panels, judged apart: verdict and reason are not about them.
     """
 
     verdict: str
@@ -52,6 +61,13 @@ class Calibration:
     z_scale: float = 1.0
     timings_s: dict[str, float] = field(default_factory=dict)
     shares: list[Shares] = field(default_factory=list)
+    dark: DarkField = DarkField('NONE', 'the bright field comes first')
+
+    @property
+    def full_reason(self) -> str:
+        """Of both fields: what is not as it should be."""
+        dark = self.dark.reason if self.dark.verdict in ('POOR', 'FAILED') else ''
+        return '; '.join(filter(None, (self.reason, dark)))
 
     def panels(self, head: HeadModel) -> list[list[PanelPose]]:
         """Fitted poses of E, N, W, S per motor position, intensities with a mean of 1."""
@@ -67,10 +83,11 @@ class Calibration:
 
 
 def calibrate(stacks: Sequence[Stack], target: RingTarget, head: HeadModel) -> Calibration:
-    """Calibrate the bright-field panels of a head.
+    """Calibrate the panels of a head.
 
     :param stacks: one per motor position, frames E, N, W, S, ALL, NONE in any order, 8 to 16 bit;
-        motor_counts in every light (without, its axis tells the tilt), exposure_scale used.
+        motor_counts in every light (without, its axis tells the tilt), exposure_scale used. The
+        first one with frames of mode DARK_FIELD and panel E, N, W or S calibrates these, too.
     :param head: as designed.
     :returns: a FAILED verdict if the pictures do not allow a calibration.
     :raises PsError: CALIBRATION_BAD_REQUEST if frames or the camera are missing.
@@ -99,10 +116,15 @@ def calibrate(stacks: Sequence[Stack], target: RingTarget, head: HeadModel) -> C
     z_scale = target.height / max(free.height, 1e-2 * target.height)
     blocked = blocked_slits(fit, head, target, camera, shares)
     verdict, reason = judge(fit, free, target, blocked)
+    dark = DarkField('NONE', 'the bright field comes first')
+    if verdict != 'FAILED':
+        dark = calibrate_dark_field(stacks, captures, fit, dots_px, head, target, camera)
+        clock['dark_field'] = time.perf_counter()
     names = list(clock)
     timings = {name: clock[name] - clock[before]
                for before, name in pairwise(names)}
-    return Calibration(verdict, reason, camera, fit, z_scale, timings, shares)
+    return Calibration(verdict, reason, camera, fit, z_scale, timings, shares,
+                       dark)
 
 
 def head_calibration(result: Calibration, head: HeadModel, target: RingTarget,
@@ -117,19 +139,38 @@ def head_calibration(result: Calibration, head: HeadModel, target: RingTarget,
     mean = np.mean([panel.intensity for panel in panels])
     corrections = {}
     for i, name in enumerate(DIRECTIONS):
-        p = result.fit.panels[i]
-        corrections[f'BF_{name}'] = PanelCorrection(
-            shift=(float(p[0]), float(p[1]), float(p[2])), tilt_offset=float(p[3]),
-            twist=float(p[4]), intensity=float(np.exp(p[5]) / mean),
-            shadow_residual_px=float(np.mean([edge[i] for edge in result.fit.edge_px])))
+        corrections[f'BF_{name}'] = _correction(
+            result.fit.panels[i], math.log(mean),
+            float(np.mean([edge[i] for edge in result.fit.edge_px])))
+    for name, dark in zip(DIRECTIONS, result.dark.panels, strict=False):
+        if dark.calibrated:
+            corrections[f'DF_{name}'] = _correction(dark.correction, 0.0, dark.edge_px)
     created = datetime.now(UTC)
     plane = result.fit.pose.plane
     return HeadCalibration.model_validate({
         'calibration_id': new_calibration_id(head_serial, created), 'created': created,
         'head_serial': head_serial, 'camera': result.camera, 'plane_normal': plane.normal,
         'plane_offset': plane.offset, 'panels': corrections, 'z_scale': result.z_scale,
-        'verdict': result.verdict, 'verdict_reason': result.reason, 'target_name': target.name,
+        'dark_field': _record(result.dark),
+        'verdict': result.verdict, 'verdict_reason': result.full_reason, 'target_name': target.name,
         'software_version': _version()})
+
+
+def _correction(p: NDArray, usual: float, edge_px: float) -> PanelCorrection:
+    """From the numbers of a fit; ``usual`` is the logarithm of the intensity that is called 1."""
+    return PanelCorrection(
+        shift=(float(p[0]), float(p[1]), float(p[2])), tilt_offset=float(p[3]), twist=float(p[4]),
+        intensity=math.exp(p[5] - usual), shadow_residual_px=edge_px)
+
+
+def _record(dark: DarkField) -> DarkFieldRecord:
+    panels = {name: DarkFieldPanel(source=panel.source, deviation=tuple(  # type: ignore
+        float(deviation) if seen else None
+        for deviation, seen in zip(panel.deviation, panel.seen, strict=True)))
+        for name, panel in zip(DIRECTIONS, dark.panels, strict=False)}
+    return DarkFieldRecord.model_validate({
+        'verdict': dark.verdict, 'reason': dark.reason, 'panels': panels,
+        'tilt': dark.tilt if math.isfinite(dark.tilt) else None})
 
 
 def _version() -> str:

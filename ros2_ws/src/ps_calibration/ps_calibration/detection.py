@@ -21,6 +21,7 @@ _AREA, _SCALE = (0.5, 1.6), 0.08
 _ASTRAY = 0.0012         # m, of a dot from where the other ones predict it
 _MOST = 40               # dark spots looked at
 _SPECK = 0.1             # of the light; what differs more counts less
+_LIT = 0.4               # of a picture's median light; dots with less of it are not looked at
 _RADIUS = 4.0            # px; as large as this a dot is easily found
 
 
@@ -58,6 +59,21 @@ def find_dots(picture: NDArray, target: RingTarget, camera: CameraGeometry) -> N
                       f'target {target.name} not found: {len(spots)} dark dots are visible, but '
                       'not in its pattern; is it the right target, entirely in the picture?')
     return np.array([_refine(picture, spots[i], radius) for i in chosen])
+
+
+def displacement(picture: NDArray, dots_px: NDArray, target: RingTarget,
+                 camera: CameraGeometry) -> float:
+    """How far the target moved between two pictures, px; dots in deep shadow do not count.
+
+    :param picture: (H, W) float, room light subtracted.
+    :param dots_px: (F, 2) the dots in the other picture, as from find_dots.
+    """
+    radius = target.fiducials.radius * camera.fx / camera.camera_standoff
+    around = cv2.blur(picture.astype(np.float32), (round(6 * radius),) * 2)
+    lit = [dot for dot in dots_px
+           if around[tuple(dot[::-1].round().astype(int))] > _LIT * np.median(around)]
+    moved = [float(np.linalg.norm(_refine(picture, dot, radius) - dot)) for dot in lit]
+    return float(np.median(moved)) if moved else 0.0
 
 
 def _dark_spots(picture: NDArray, radius: float) -> NDArray:

@@ -13,12 +13,12 @@ from ps_head_driver.camera_model import scaled_camera
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import DIRECTIONS, CameraGeometry, HeadModel
 from ps_head_driver.kinematics import BrightFieldKinematics
-from ps_head_driver.stack import Mode, Panel, Stack
+from ps_head_driver.stack import Light, Mode, Panel, Stack
 
 _SATURATED = 0.002       # part of the pixels at the end of the range
 _DARK = 0.05             # mean of a picture, relative to the end of its range
 _DEAD = 0.3              # of the mean of the four panels
-_MOVED_PX = 0.3          # of a dot, between two pictures
+MOVED_PX = 0.3          # of a dot, between two pictures
 
 
 def common_camera(stacks: Sequence[Stack], head: HeadModel) -> CameraGeometry:
@@ -44,6 +44,11 @@ def nominal_tilt(stack: Stack, kinematics: BrightFieldKinematics) -> float:
     return math.acos(min(max(-light.axis[2], -1.0), 1.0))
 
 
+def stated_tilt(light: Light) -> float:
+    """Tilt of a panel as its picture states it, or else from the light's own axis, rad."""
+    return light.tilt or math.acos(min(max(-light.axis[2], -1.0), 1.0))
+
+
 def _range_of(images: Sequence[NDArray]) -> float:
     """End of the grey values' range; cameras deliver 10, 12 or 14 bit in words of 16."""
     if not np.issubdtype(images[0].dtype, np.integer):
@@ -54,10 +59,10 @@ def _range_of(images: Sequence[NDArray]) -> float:
     return float(next(2**bits - 1 for bits in (10, 12, 14, 16) if highest < 2**bits))
 
 
-def _frame(stack: Stack, panel: Panel) -> tuple[NDArray, float]:
+def _frame(stack: Stack, panel: Panel, mode: Mode) -> tuple[NDArray, float]:
     """One frame and its exposure."""
     for image, light in zip(stack.images, stack.lights, strict=True):
-        if light.panel == panel and light.mode == Mode.BRIGHT_FIELD:
+        if light.panel == panel and light.mode == mode:
             return image, light.exposure_scale
     if panel == Panel.NONE and stack.ambient is not None:
         return stack.ambient, 1.0
@@ -66,22 +71,34 @@ def _frame(stack: Stack, panel: Panel) -> tuple[NDArray, float]:
                   'calibration needs E, N, W, S, ALL and NONE')
 
 
+def without_room(stack: Stack, panel: Panel, mode: Mode = Mode.BRIGHT_FIELD,
+                 ) -> tuple[NDArray, NDArray]:
+    """One frame at unit exposure without the light of the room, and where it is saturated.
+
+    :returns: (H, W) float32, and (H, W) bool.
+    :raises PsError: CALIBRATION_BAD_REQUEST if there is no such frame.
+    """
+    image, scale = _frame(stack, panel, mode)
+    dark, dark_scale = _frame(stack, Panel.NONE, Mode.BRIGHT_FIELD)
+    # the room shines for as long as the shutter is open
+    grey = image.astype(np.float32) / scale - dark.astype(np.float32) / dark_scale
+    burnt = image >= _range_of(stack.images)
+    return (grey.mean(axis=-1), burnt.any(axis=-1)) if grey.ndim == 3 else (grey, burnt)
+
+
 def light_only(stack: Stack) -> list[NDArray]:
     """E, N, W, S at equal exposure, without the light of the room.
 
     :raises PsError: CALIBRATION_CAPTURE_FAILED for pictures that cannot be used.
     """
     code, name = ErrorCode.CALIBRATION_CAPTURE_FAILED, stack.stack_id or 'pictures'
-    dark, dark_scale = _frame(stack, Panel.NONE)
     full = _range_of(stack.images)
     frames = []
     for panel in (Panel.E, Panel.N, Panel.W, Panel.S, Panel.ALL):
-        image, scale = _frame(stack, panel)
-        if np.mean(image >= full) > _SATURATED:
+        picture, burnt = without_room(stack, panel)
+        if burnt.mean() > _SATURATED:
             raise PsError(code, f'{name}: frame {panel.name} is saturated; lower its exposure')
-        # the room shines for as long as the shutter is open
-        grey = image.astype(np.float32) / scale - dark.astype(np.float32) / dark_scale
-        frames.append(grey.mean(axis=-1) if grey.ndim == 3 else grey)
+        frames.append(picture)
     singles, together = frames[:4], frames[4]
     means = np.array([float(frame.mean()) for frame in singles])
     if math.isfinite(full) and means.max() < _DARK * full:
@@ -103,7 +120,7 @@ def locate(captures: Sequence[Sequence[NDArray]], target: RingTarget,
                       for capture in captures])
     moved = np.linalg.norm(found - np.median(found, axis=(0, 1)), axis=-1).max(axis=-1)
     position, frame = np.unravel_index(moved.argmax(), moved.shape)
-    if moved.max() > _MOVED_PX:
+    if moved.max() > MOVED_PX:
         raise PsError(ErrorCode.CALIBRATION_CAPTURE_FAILED,
                       f'position {position + 1}: the target moved by {moved.max():.1f} px in '
                       f'frame {[*DIRECTIONS, "ALL"][frame]}; keep head and target still')

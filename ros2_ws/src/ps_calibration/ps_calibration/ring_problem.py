@@ -3,9 +3,9 @@
 Residuals and their derivatives for ring_fit.py.
 """
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import product
 import math
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from ps_head_driver.camera_model import plane_points
 from ps_head_driver.head_model import DIRECTIONS, CameraGeometry, HeadModel
 from ps_head_driver.kinematics import PanelPose, PanelRing
 
+Field = Literal['bright_field', 'dark_field']
 # parameters of one panel: shift (radial, tangential, z), tilt_offset, twist, log of intensity
 PER_PANEL = 6
 # what is known of them beforehand: three times the tolerances of manufacture
@@ -34,17 +35,16 @@ _DOT_NOISE_PX = 0.003
 _SOFT = 3.0              # standard deviations from which on a residual counts less
 
 
-def corrected(head: HeadModel, panels: NDArray) -> HeadModel:
-    """The head with corrections (4, PER_PANEL) added to its bright-field panels."""
-    ring = {}
+def corrected(head: HeadModel, panels: NDArray, field: Field = 'bright_field') -> HeadModel:
+    """The head with corrections (4, PER_PANEL) added to the panels of one field."""
+    ring, section = {}, getattr(head, field)
     for name, p in zip(DIRECTIONS, panels, strict=True):
-        old = head.bright_field.panels[name]  # type: ignore[index]
+        old = section.panels[name]
         ring[name] = old.model_copy(update={
             'shift': (old.shift[0] + p[0], old.shift[1] + p[1], old.shift[2] + p[2]),
             'tilt_offset': old.tilt_offset + p[3], 'twist': old.twist + p[4],
             'intensity': old.intensity * float(np.exp(p[5]))})
-    return head.model_copy(
-        update={'bright_field': head.bright_field.model_copy(update={'panels': ring})})
+    return head.model_copy(update={field: section.model_copy(update={'panels': ring})})
 
 
 class RingProblem:
@@ -109,11 +109,8 @@ class RingProblem:
         pose = self.pose(x)
         panels = x[:4 * PER_PANEL].reshape(4, PER_PANEL)
         ring = PanelRing(corrected(self.head, panels).bright_field)
-        found = [ring.pose(name, self.tilt(x, position))  # type: ignore[arg-type]
-                 for name in DIRECTIONS]
-        return [replace(panel, center=pose.to_target(panel.center),
-                        axis=panel.axis @ pose.rotation, right=panel.right @ pose.rotation)
-                for panel in found]
+        return [pose.panel_to_target(ring.pose(name, self.tilt(x, position)))  # type: ignore
+                for name in DIRECTIONS]
 
     def lights(self, x: NDArray) -> list[NDArray]:
         """Irradiance per position, (4, N)."""
@@ -179,7 +176,7 @@ class RingProblem:
                 own = (range(4) if k >= 4 * PER_PANEL else [k // PER_PANEL])
                 after = self.panels(moved, position)
                 for i in own:
-                    rates[k, i] = by_motion[i] @ _motion(panels[i], after[i]) / step
+                    rates[k, i] = by_motion[i] @ rigid_motion(panels[i], after[i]) / step
             if 4 * PER_PANEL <= k < self.first_tilt:
                 shift = (self.points(moved, position) - points) / step
                 rates[k] += by_point[0] * shift[:, 0] + by_point[1] * shift[:, 1]
@@ -218,7 +215,7 @@ class RingProblem:
         return np.concatenate([*parts, dots, np.diag(1 / self.prior)], axis=1).T
 
 
-def _motion(before: PanelPose, after: PanelPose) -> NDArray:
+def rigid_motion(before: PanelPose, after: PanelPose) -> NDArray:
     """Small shift and turn from one pose to another, (6,)."""
     first, second = (np.stack([pose.axis, pose.right, np.cross(pose.axis, pose.right)])
                      for pose in (before, after))

@@ -62,6 +62,47 @@ class Shares:
         return replace(self, noise=noise)
 
 
+@dataclass(frozen=True)
+class PlateBlocks:
+    """Pictures averaged over square blocks of pixels.
+
+    :param means: (K, R, C) float64, of the K pictures.
+    :param pixels: (2, R, C), column and row of the blocks' middles.
+    :param distance: (R, C) from the wall, m; NaN where something else than the plate is seen.
+    :param side: of the blocks, px.
+    """
+
+    means: NDArray
+    pixels: NDArray
+    distance: NDArray
+    side: int
+
+
+def plate_blocks(pictures: Sequence[NDArray], pose: TargetPose, target: RingTarget,
+                 camera: CameraGeometry, length: float = _BLOCK) -> PlateBlocks:
+    """Average pictures over blocks, and find those where only the plate is seen.
+
+    :param pictures: (H, W) float each.
+    :param length: of the blocks on the plate, m; at least a pixel.
+    """
+    side = max(1, round(length * camera.fx / camera.camera_standoff))
+    rows, columns = (n // side for n in pictures[0].shape)
+    means = np.stack([
+        p[:rows * side, :columns * side].reshape(rows, side, columns, side).mean(axis=(1, 3))
+        for p in pictures])
+    v, u = np.mgrid[:rows, :columns] * side + (side - 1) / 2
+    x, y, _ = np.moveaxis(pose.to_target(
+        plane_points(camera, np.stack([u, v], axis=-1), pose.plane)), -1, 0)
+    half = np.array(target.base.size) / 2 - _CLEAR
+    total = means.sum(axis=0)
+    distance = target.distance(x, y)
+    keep = (distance > _CLEAR) & (np.hypot(x, y) > _CLEAR) & (
+        abs(x) < half[0]) & (abs(y) < half[1]) & (total > 0.1 * np.median(total))
+    for dot in target.fiducials.centres:
+        keep &= np.hypot(x - dot[0], y - dot[1]) > target.fiducials.radius + _CLEAR / 2
+    return PlateBlocks(means, np.stack([u, v]), np.where(keep, distance, math.nan), side)
+
+
 def measure_shares(pictures: Sequence[NDArray], tilt: float, pose: TargetPose,
                    target: RingTarget, camera: CameraGeometry) -> Shares:
     """Average the pictures of one motor position over blocks where only the plate is seen.
@@ -69,35 +110,20 @@ def measure_shares(pictures: Sequence[NDArray], tilt: float, pose: TargetPose,
     :param pictures: E, N, W, S, (H, W) float, room light subtracted, equal exposure.
     :param tilt: nominal, rad.
     """
-    side = max(1, round(_BLOCK * camera.fx / camera.camera_standoff))
-    rows, columns = (n // side for n in pictures[0].shape)
-    blocks = np.stack([
-        p[:rows * side, :columns * side].reshape(rows, side, columns, side).mean(axis=(1, 3))
-        for p in pictures]).reshape(4, -1)
-    middle = (side - 1) / 2
-    v, u = np.mgrid[:rows, :columns] * side + middle
-    pixels = np.stack([u, v], axis=-1).reshape(-1, 2)
-    points = pose.to_target(plane_points(camera, pixels, pose.plane))
-    x, y = points[:, 0], points[:, 1]
-    half = np.array(target.base.size) / 2 - _CLEAR
-    total = blocks.sum(axis=0)
-    distance = target.distance(x, y)
-    keep = (distance > _CLEAR) & (np.hypot(x, y) > _CLEAR) & (
-        abs(x) < half[0]) & (abs(y) < half[1]) & (total > 0.1 * np.median(total))
-    for dot in target.fiducials.centres:
-        keep &= np.hypot(x - dot[0], y - dot[1]) > target.fiducials.radius + _CLEAR / 2
-    grid = np.concatenate([blocks, pixels.T]).reshape(6, rows, columns)
+    blocks = plate_blocks(pictures, pose, target, camera)
+    distance = blocks.distance
+    grid = np.concatenate([blocks.means, blocks.pixels])
+    i, j = np.indices(distance.shape)
     parts = []
-    i, j = (pixels // side).astype(int).T
     for size, here in ((1, (distance < _REACH) & ((i + j) % _PART == 0)),
                        (_FAR, distance >= _REACH)):
-        whole = _merge((keep & here).reshape(1, rows, columns), size)[0] == 1
+        whole = _merge(here[None], size)[0] == 1
         parts.append(_merge(grid, size)[:, whole])
     merged = np.concatenate(parts, axis=1)
     values = merged[:4] / merged[:4].sum(axis=0)
     return Shares(tilt, merged[4:].T.copy(), values,
                   _noise([part[:4] / part[:4].sum(axis=0) for part in parts]), parts[0].shape[1],
-                  side)
+                  blocks.side)
 
 
 def _merge(grid: NDArray, size: int) -> NDArray:

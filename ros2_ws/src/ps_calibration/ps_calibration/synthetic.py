@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ps_calibration.ring_fit import corrected
 from ps_calibration.ring_target import RingTarget
 from ps_head_driver.camera_model import plane_points
-from ps_head_driver.fake.renderer import Sensor, make_renderer
+from ps_head_driver.fake.renderer import OFF, Sensor, make_renderer
 from ps_head_driver.fake.ring_renderer import Placement, RingRenderer, RingSolid, placement
 from ps_head_driver.head_model import DIRECTIONS, HeadModel
 from ps_head_driver.kinematics import BrightFieldKinematics, as_light, lights_at
@@ -17,6 +17,9 @@ from ps_head_driver.light_model import light_vectors
 from ps_head_driver.stack import Light, Panel, Plane, Stack, Truth, angular_error_deg
 
 _LENS = (-0.05, 0.0, 0.0, 0.0, 0.0)     # a pixel or so in the corners of the picture
+
+_DARK_FIELD = 8                         # draws the dark field apart, the rest stays as it is
+DF_TILT = 1.3                           # rad, where the servo stands after power-up
 
 
 @dataclass(frozen=True)
@@ -45,32 +48,47 @@ def random_bench(nominal: HeadModel, seed: int) -> Bench:
     2 mm and turned by 5 degrees, all at most; a lens with distortion.
     """
     random = np.random.default_rng(seed)
-    panels = np.concatenate([
-        random.uniform(-0.003, 0.003, (4, 3)), np.radians(random.uniform(-2, 2, (4, 2))),
-        np.log(random.uniform(0.95, 1.05, (4, 1)))], axis=1)
+    panels = _panels_off(random)
+    dark = _panels_off(np.random.default_rng([seed, _DARK_FIELD]))
     camera = nominal.camera.model_copy(update={'distortion': _LENS})
     x, y, tilt_x, tilt_y = random.uniform(-1, 1, 4) * [0.002, 0.002, 0.0175, 0.0175]
     where = placement(x, y, random.uniform(-0.0005, 0.0005),
                       math.radians(random.uniform(-5, 5)), tilt_x, tilt_y)
-    return Bench(corrected(nominal.model_copy(update={'camera': camera}), panels), where)
+    head = corrected(nominal.model_copy(update={'camera': camera}), panels)
+    return Bench(corrected(head, dark, 'dark_field'), where)
+
+
+def _panels_off(random: np.random.Generator) -> NDArray:
+    """Corrections of four panels within the tolerances of manufacture, as of a RingFit."""
+    return np.concatenate([
+        random.uniform(-0.003, 0.003, (4, 3)), np.radians(random.uniform(-2, 2, (4, 2))),
+        np.log(random.uniform(0.95, 1.05, (4, 1)))], axis=1)
 
 
 def render_stack(bench: Bench, nominal: HeadModel, solid: RingSolid, m_counts: int,
-                 scale: float = 1.0, seed: int = 1, tilt: float | None = None) -> Stack:
+                 scale: float = 1.0, seed: int = 1, tilt: float | None = None,
+                 dark_field: bool = False) -> Stack:
     """The six pictures of one motor position, labelled with the nominal lights.
 
     :param m_counts: of the encoder.
     :param scale: of the pictures.
     :param tilt: that the panels really have, rad; None: that of the nominal crank.
+    :param dark_field: four more pictures, under the panels of the dark field.
     """
     sensor = Sensor(ambient=0.02, vignetting=0.1)
     renderer = RingRenderer(solid, bench.where, bench.head, sensor, scale, seed)
     if tilt is None:
         tilt = float(BrightFieldKinematics(nominal).tilt(m_counts))
-    lights = [*lights_at(nominal, m_counts, nominal.dark_field.tilt_range[0])[:4],
+    all_lights = lights_at(nominal, m_counts, DF_TILT)
+    lights = [*all_lights[:4],
               Light(panel=Panel.ALL, motor_counts=m_counts, exposure_scale=0.25, name='ALL'),
               Light(panel=Panel.NONE, motor_counts=m_counts, name='NONE')]
-    return Stack(images=renderer.capture(tilt, 0.8), lights=lights, camera=renderer.camera)
+    images = renderer.capture(tilt, 0.8)
+    if dark_field:
+        lights += all_lights[4:]
+        images += [renderer.render(tilt, DF_TILT, OFF, list(levels), 0.8 * sensor.exposure,
+                                   frame=len(images) + i) for i, levels in enumerate(np.eye(4))]
+    return Stack(images=images, lights=lights, camera=renderer.camera)
 
 
 def render_part(bench: Bench, nominal: HeadModel, scene: str, m_counts: int,

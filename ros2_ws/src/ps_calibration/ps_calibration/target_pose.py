@@ -1,5 +1,5 @@
 """Where a target lies under the camera: from its dots to plane, pose and homography."""
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from ps_calibration.ring_target import RingTarget
 from ps_head_driver.camera_model import plane_points, project
 from ps_head_driver.head_model import CameraGeometry
+from ps_head_driver.kinematics import PanelPose
 from ps_head_driver.stack import Plane
 
 # what the six numbers of a pose are: position (m), then turn about the normal, tilts (rad)
@@ -50,6 +51,11 @@ class TargetPose:
     def to_target(self, points: NDArray) -> NDArray:
         """From ps_head_plane into the target frame, (..., 3)."""
         return (points - self.position) @ self.rotation
+
+    def panel_to_target(self, panel: PanelPose) -> PanelPose:
+        """A panel given in ps_head_plane, in the target frame."""
+        return replace(panel, center=self.to_target(panel.center),
+                       axis=panel.axis @ self.rotation, right=panel.right @ self.rotation)
 
     def to_head(self, points: NDArray) -> NDArray:
         """From the target frame into ps_head_plane, (..., 3)."""

@@ -1,11 +1,14 @@
 """How well the light is known: the fit's covariance, carried over to what a user asks for."""
 from collections.abc import Callable
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ps_calibration.ring_fit import PER_PANEL, RingFit, corrected
+from ps_calibration.dark_field import DarkField
+from ps_calibration.ring_fit import RingFit
+from ps_calibration.ring_problem import PER_PANEL, Field, corrected
 from ps_calibration.target_pose import TargetPose
 from ps_head_driver.camera_model import plane_points
 from ps_head_driver.head_model import DIRECTIONS, CameraGeometry, HeadModel
@@ -65,11 +68,45 @@ def light_figures(fit: RingFit, head: HeadModel, camera: CameraGeometry,
         float(np.sqrt(np.linalg.eigvalsh(tilts)[-1])))
 
 
+@dataclass(frozen=True)
+class PanelFigures:
+    """The light of one dark-field panel where the optical axis meets the plane.
+
+    :param direction: (3,) unit vector towards the light.
+    :param direction_deviation: rad, in the worst direction; noise alone. NaN if it failed.
+    """
+
+    direction: NDArray
+    direction_deviation: float
+
+
+def dark_figures(dark: DarkField, pose: TargetPose, head: HeadModel,
+                 camera: CameraGeometry) -> list[PanelFigures]:
+    """Directions of the dark field's light, E, N, W, S.
+
+    :param pose: of the target.
+    :param head: as designed.
+    """
+    def direction(i: int, x: NDArray) -> NDArray:
+        rows = np.zeros((4, PER_PANEL))
+        rows[i] = x
+        found = corrected(head, rows, 'dark_field')
+        return light_directions(found, pose, camera, dark.tilt, 'dark_field')[i]
+
+    figures = []
+    for i, panel in enumerate(dark.panels):
+        rates = _rates(lambda x, i=i: direction(i, x), panel.correction)   # type: ignore[misc]
+        deviation = (math.sqrt(np.linalg.eigvalsh(rates @ panel.covariance @ rates.T)[-1])
+                     if panel.calibrated else math.nan)
+        figures.append(PanelFigures(direction(i, panel.correction), deviation))
+    return figures
+
+
 def light_directions(head: HeadModel, pose: TargetPose, camera: CameraGeometry,
-                     tilt: float) -> NDArray:
+                     tilt: float, field: Field = 'bright_field') -> NDArray:
     """Unit vectors towards the light of E, N, W, S at the middle of the plane, (4, 3)."""
     point = plane_points(camera, [camera.cx, camera.cy], pose.plane)
-    ring = PanelRing(head.bright_field)
+    ring = PanelRing(getattr(head, field))
     vectors = np.stack([light_vectors(as_light(ring.pose(name, tilt)), point)  # type: ignore
                         for name in DIRECTIONS])
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

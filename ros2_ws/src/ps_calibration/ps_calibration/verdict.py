@@ -16,6 +16,11 @@ _BLOCKED = 0.5           # of a slit
 _LIMIT = np.array([0.006, 0.006, 0.006, 0.07, 0.07, 0.25])
 
 
+def out_of_place(panel: NDArray) -> bool:
+    """Whether corrections, the first of _LIMIT, are beyond what any mounting explains."""
+    return bool(np.any(abs(panel) > _LIMIT[:len(panel)] * _UNLIKELY))
+
+
 def _rms(fit: RingFit) -> float:
     return max(float(np.sqrt(np.mean(r**2))) for r in fit.residuals)
 
@@ -42,9 +47,9 @@ def judge(fit: RingFit, free: RingFit, target: RingTarget, blocked: NDArray) -> 
     if rms > _FAILED_RMS:
         return 'FAILED', (f'the shadows do not fit this target (residual {rms:.3f}); is it '
                           'another ring than the target file says, or damaged?')
-    beyond = abs(fit.panels) > _LIMIT * _UNLIKELY
-    if beyond.any():
-        name = DIRECTIONS[int(np.argmax(beyond.any(axis=1)))]
+    beyond = [out_of_place(panel) for panel in fit.panels]
+    if any(beyond):
+        name = DIRECTIONS[beyond.index(True)]
         return 'FAILED', (f'panel {name} would be far out of its place; is it another ring than '
                           'the target file says? if not, check the mounting of the panel')
     if rms > _POOR_RMS:

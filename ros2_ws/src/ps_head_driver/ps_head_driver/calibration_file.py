@@ -21,6 +21,7 @@ from ps_head_driver.head_model import (
     DIRECTIONS,
     BrightField,
     CameraGeometry,
+    Direction,
     HeadModel,
     PanelTolerance,
     parse_yaml,
@@ -73,6 +74,28 @@ class MotorCorrection(_Section):
                 update={'offset': field.crank.offset + self.crank_offset})})
 
 
+class DarkFieldPanel(_Section):
+    """What told where a dark-field panel is, and how well it is known.
+
+    :param source: shadows of the target, plate (the fall-off over it alone), or nominal: it was
+        not calibrated and has no entry in ``panels``.
+    :param deviation: standard deviations of shift (radial, tangential, z; m), tilt_offset and
+        twist (rad) and intensity (relative); None for what stays as in the head file.
+    """
+
+    source: Literal['shadows', 'plate', 'nominal'] = 'nominal'
+    deviation: tuple[float | None, ...] = (None,) * 6
+
+
+class DarkFieldRecord(_Section):
+    """How the dark field's part of a calibration came about; NONE: it was not asked for."""
+
+    verdict: Literal['NONE', 'OK', 'POOR', 'FAILED'] = 'NONE'
+    reason: str = ''
+    tilt: float | None = None                            # of the servo, rad
+    panels: dict[Direction, DarkFieldPanel] = Field(default_factory=dict)
+
+
 class HeadCalibration(_Section):
     """Result of a ring calibration; units and frames as in ps_interfaces/HeadCalibration."""
 
@@ -85,6 +108,7 @@ class HeadCalibration(_Section):
     panels: dict[PanelName, PanelCorrection] = Field(default_factory=dict)
     backlash_counts: Annotated[int, Field(ge=0)] = 0
     motor: MotorCorrection = MotorCorrection()
+    dark_field: DarkFieldRecord = DarkFieldRecord()
     z_scale: Annotated[float, Field(gt=0)] = 1.0
     verdict: Verdict
     verdict_reason: str = ''

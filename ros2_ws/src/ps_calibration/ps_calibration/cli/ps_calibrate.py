@@ -11,9 +11,11 @@ import numpy as np
 from ps_calibration.before_after import Outcome, compare
 from ps_calibration.calibrate import Calibration, calibrate
 from ps_calibration.catalogue import list_calibrations
+from ps_calibration.dark_field import PARAMETERS as DARK_PARAMETERS
 from ps_calibration.motor_calibration import motor_of
 from ps_calibration.report import Evidence, gather, report, write_report
 from ps_calibration.ring_target import RingTarget, default_target_path, load_target
+from ps_calibration.uncertainty import dark_figures
 from ps_head_driver.calibration_file import write_calibration
 from ps_head_driver.errors import PsError
 from ps_head_driver.head_model import DIRECTIONS, HeadModel, load_head, nominal_head_path
@@ -24,9 +26,10 @@ from ps_head_driver.stack_folder import read_lights, read_stack
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='ps_calibrate', formatter_class=argparse.RawDescriptionHelpFormatter,
-        description='Calibrate the bright-field panels from pictures of the half-ring target. '
+        description='Calibrate the panels of a head from pictures of the half-ring target. '
                     'Each folder is a stack folder at one motor position with the frames E, N, '
-                    'W, S, ALL and NONE.',
+                    'W, S, ALL and NONE; frames of mode DARK_FIELD in one of them '
+                    'calibrate the dark-field panels, too.',
         epilog='example: ps_calibrate pictures/m25000 pictures/m30000 --out calibration.yaml '
                '--report report.html')
     parser.add_argument('folders', nargs='*', type=Path, metavar='FOLDER')
@@ -75,6 +78,7 @@ def as_json(evidence: Evidence, folders: list[Path]) -> dict:
                           'offset': fit.pose.plane.offset},
         'z_scale': result.z_scale if fit else None,
         'camera_to_plane': None if homography is None else homography.tolist(),
+        'dark_field': dark_field_as_json(evidence, folders),
         'condition': fit and fit.condition, 'motor': motor and _numbers(vars(motor)),
         'repeatability': [
             {'count': group.count, 'direction_deg': np.degrees(group.direction).tolist(),
@@ -89,6 +93,32 @@ def as_json(evidence: Evidence, folders: list[Path]) -> dict:
         'timings_s': result.timings_s}
 
 
+def dark_field_as_json(evidence: Evidence, folders: list[Path]) -> dict:
+    """The dark-field panels: what was found and how; ``lights`` is empty without pictures."""
+    dark, head, fit = evidence.result.dark, evidence.head, evidence.result.fit
+    lights = []
+    if fit is not None and dark.panels:
+        figures = dark_figures(dark, fit.pose, head, evidence.result.camera)
+        for name, pose, panel, light in zip(DIRECTIONS, dark.poses(head), dark.panels, figures,
+                                            strict=True):
+            parameters = {
+                key: {'correction': float(value), 'deviation': float(deviation),
+                      'known': bool(seen)}
+                for key, value, deviation, seen in zip(
+                    DARK_PARAMETERS, panel.correction, panel.deviation, panel.seen, strict=True)}
+            lights.append({
+                'panel': name, 'verdict': panel.verdict, 'reason': panel.reason,
+                'source': panel.source, 'position': pose.center.tolist(),
+                'axis': pose.axis.tolist(), **_numbers({
+                    'intensity': pose.intensity,
+                    'direction_deviation_deg': math.degrees(light.direction_deviation),
+                    'shadow_residual_px': panel.edge_px}),
+                'parameters': parameters if panel.calibrated else None})
+    return {'verdict': dark.verdict, 'reason': dark.reason,
+            'folder': str(folders[dark.position]) if lights else None,
+            'tilt_rad': dark.tilt if lights else None, 'lights': lights}
+
+
 def _print(evidence: Evidence) -> None:
     result, motor = evidence.result, evidence.motor
     print(f'{result.verdict} {result.reason}'.strip())
@@ -96,6 +126,11 @@ def _print(evidence: Evidence) -> None:
         for name, panel in zip(DIRECTIONS, panels, strict=True):
             x, y, z = panel.center * 1e3
             print(f'panel {name}  at ({x:.2f}, {y:.2f}, {z:.2f}) mm')
+    print(f'dark field  {result.dark.verdict} {result.dark.reason}'.strip())
+    for name, pose, found in zip(DIRECTIONS, result.dark.poses(evidence.head), result.dark.panels,
+                                 strict=False):
+        x, y, z = pose.center * 1e3
+        print(f'panel DF_{name}  at ({x:.2f}, {y:.2f}, {z:.2f}) mm, from {found.source}')
     print(f'z scale  {result.z_scale:.4f}')
     if motor:
         print(f'motor    offset {motor.offset_counts:.0f} counts, scale {motor.scale:.5f}, '

@@ -46,6 +46,7 @@ PARAMETERS = [
     Parameter('convergence_radii', [0.05, 0.0685], 'Convergence radii at which a calibration '
               'takes its pictures', 'm'),
     Parameter('exposure', 0.003, 'Exposure of the pictures with one panel', 's', 1e-4, 1.0),
+    Parameter('dark_field', True, 'Calibrate the dark-field panels, too'),
     Parameter('capture_timeout', 60.0, 'Longest wait for the pictures at one convergence radius',
               's', 1.0, 600.0),
 ]
@@ -216,7 +217,7 @@ class RingCalibration(Node):
         self._feedback(goal, CalibrateRing.Feedback.FITTING, done, len(radii))
         fitted = self._in_worker(lambda: calibrate(stacks, target, self.head))
         result.verdict = getattr(ps.HeadCalibration, f'VERDICT_{fitted.verdict}')
-        result.reason = fitted.reason
+        result.reason = fitted.full_reason
         if fitted.fit is not None:
             result.residuals_px = [float(edge) for edges in fitted.fit.edge_px for edge in edges]
         self._feedback(goal, CalibrateRing.Feedback.REPORTING, done, len(radii))
@@ -235,6 +236,8 @@ class RingCalibration(Node):
         write_calibration(calibration, path)
         result.calibration = calibration_to_message(calibration, self.head)
         result.message = f'{calibration.verdict}, written to {path}, report beside it'
+        if fitted.dark.verdict != 'OK':
+            result.message += f'; dark field {fitted.dark.verdict}: {fitted.dark.reason}'
         if request.apply and calibration.verdict == 'OK':
             self._source.check(self._cancelled.is_set)
             self.active, self.refused = calibration, ''
@@ -257,7 +260,7 @@ class RingCalibration(Node):
                     self._feedback(goal, state.MOVING if moving else state.CAPTURING, number,
                                    len(radii), hint)
                 stack = self._source.take(
-                    AcquireStack.Goal(steps=self._steps(radius), part_id='ring calibration'),
+                    AcquireStack.Goal(steps=self._steps(radius, number == 0), part_id='ring calibration'),
                     self.parameters['capture_timeout'], self._cancelled.is_set, on_feedback)
                 if keep is not None:
                     _keep(stack, keep / f'position_{number + 1}')
@@ -266,14 +269,19 @@ class RingCalibration(Node):
                 stacks.append(stack)
         return stacks
 
-    def _steps(self, radius: float) -> list[ps.LightStep]:
-        """Frames of one position; all panels together get a quarter of the exposure."""
-        exposure = self.parameters['exposure']
-        frames = [*((panel, exposure) for panel in (Panel.E, Panel.N, Panel.W, Panel.S)),
-                  (Panel.ALL, exposure / 4), (Panel.NONE, exposure)]
-        return [ps.LightStep(mode=ps.Panel.BRIGHT_FIELD, panel=int(panel),
-                             convergence_radius=float(radius), exposure_time=time)
-                for panel, time in frames]
+    def _steps(self, radius: float, first: bool) -> list[ps.LightStep]:
+        """Frames of one position; all panels together get a quarter of the exposure.
+
+        The dark field does not move with the motor: it is taken at the first position alone.
+        """
+        exposure, singles = self.parameters['exposure'], (Panel.E, Panel.N, Panel.W, Panel.S)
+        bright, dark = ps.Panel.BRIGHT_FIELD, ps.Panel.DARK_FIELD
+        frames = [*((bright, panel, exposure) for panel in singles),
+                  (bright, Panel.ALL, exposure / 4), (bright, Panel.NONE, exposure)]
+        if first and self.parameters['dark_field']:
+            frames += [(dark, panel, exposure) for panel in singles]
+        return [ps.LightStep(mode=mode, panel=int(panel), convergence_radius=float(radius),
+                             exposure_time=time) for mode, panel, time in frames]
 
     def _in_worker(self, compute: Callable[[], Outcome]) -> Outcome:
         """Compute in a thread of its own: a cancel does not wait for it."""

@@ -1,0 +1,322 @@
+"""Where the dark-field panels are, and how bright, from pictures of the half ring under them.
+
+Their light grazes the plate: it falls off quickly, and the ring's shadows are long and soft. Both
+are fitted, for each panel on its own, starting from the head file; see plate_light.py for what is
+measured. A panel that cannot be calibrated keeps its nominal geometry and says why.
+"""
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import OptimizeResult, least_squares
+
+from ps_calibration.detection import displacement
+from ps_calibration.plate_light import (
+    PlateLight,
+    free_light,
+    light_of,
+    measure_plate_light,
+)
+from ps_calibration.ring_fit import RingFit
+from ps_calibration.ring_problem import PER_PANEL, corrected, rigid_motion
+from ps_calibration.ring_pictures import MOVED_PX, stated_tilt, without_room
+from ps_calibration.ring_target import RingTarget
+from ps_calibration.robust import soft
+from ps_calibration.shadow_model import light_and_rates
+from ps_calibration.target_pose import TargetPose
+from ps_calibration.verdict import out_of_place
+from ps_head_driver.errors import PsError
+from ps_head_driver.head_model import DIRECTIONS, CameraGeometry, HeadModel
+from ps_head_driver.kinematics import PanelPose, PanelRing
+from ps_head_driver.stack import Mode, Panel, Stack
+
+# what is known of a panel beforehand: three times the tolerances of manufacture; its LEDs may be
+# others than those of the bright field
+_PRIOR = np.array([0.009, 0.009, 0.009, 0.105, 0.105, 0.5])
+_STEPS = np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3])      # typical sizes of the parameters
+_MODEL = 1e-3            # relative error expected of the model of the light
+_SOFT = 3.0              # standard deviations from which on a residual counts less
+_POINT_STEP = 1e-5       # m
+_DEAD = 0.3              # of the median of the four panels
+_BURNT = 0.2             # part of the plate that may be saturated
+_SOFT_SHADOW = 0.05, 0.95        # part of a panel seen from a block in soft shadow
+_SHADED = 100            # blocks in soft shadow tell where a panel is
+_POOR_RMS, _FAILED_RMS = 0.03, 0.10      # of what is left, relative to the panel's own light
+_NOT_SEEN = 0.7          # of what is known beforehand: a deviation beyond tells nothing new
+PARAMETERS = 'radial', 'tangential', 'z', 'tilt_offset', 'twist', 'log_intensity'
+NOMINAL = 'it keeps the geometry of the head file'
+
+
+@dataclass(frozen=True)
+class DarkPanel:
+    """One panel.
+
+    :param verdict: OK, POOR or FAILED; a failed one keeps its nominal geometry.
+    :param reason: of one that is not OK.
+    :param correction: (PER_PANEL,) shift (radial, tangential, z), tilt_offset, twist, logarithm
+        of the intensity relative to the mean of the bright field; zeros if it failed.
+    :param covariance: (PER_PANEL, PER_PANEL) of it: what noise does.
+    :param shaded: blocks of the plate in soft shadow of the wall.
+    :param residuals: (N,) measured minus fitted light, relative to the light without shadow.
+    :param edge_px: what they amount to as a shift of the shadow edges.
+    :param scatter: of the residuals relative to the noise expected, robust, at least 1.
+    """
+
+    verdict: str
+    reason: str = ''
+    correction: NDArray = field(default_factory=lambda: np.zeros(PER_PANEL))
+    covariance: NDArray = field(
+        default_factory=lambda: np.full((PER_PANEL, PER_PANEL), math.nan))
+    shaded: int = 0
+    residuals: NDArray = field(default_factory=lambda: np.zeros(0))
+    edge_px: float = math.nan
+    scatter: float = math.nan
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the correction is better than none."""
+        return self.verdict != 'FAILED'
+
+    @property
+    def deviation(self) -> NDArray:
+        """Standard deviations of the correction, (PER_PANEL,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def seen(self) -> NDArray:
+        """Which parameters the pictures tell, (PER_PANEL,) bool; the others stay nominal."""
+        return np.asarray(self.deviation < _NOT_SEEN * _PRIOR)
+
+    @property
+    def source(self) -> str:
+        """What told: 'shadows', 'plate' (the fall-off over it alone) or 'nominal' (nothing)."""
+        if not self.calibrated:
+            return 'nominal'
+        return 'shadows' if self.shaded >= _SHADED else 'plate'
+
+    @property
+    def rms(self) -> float:
+        """Of the residuals; NaN without any."""
+        known = self.residuals[np.isfinite(self.residuals)]
+        return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
+
+
+@dataclass(frozen=True)
+class DarkField:
+    """The four panels.
+
+    :param verdict: OK, POOR (not all panels, or badly), FAILED (no panel) or NONE (no pictures).
+    :param reason: of a verdict that is not OK.
+    :param tilt: of the servo while the pictures were taken, rad.
+    :param position: which stack they are in.
+    :param panels: E, N, W, S.
+    :param light: what was fitted.
+    """
+
+    verdict: str
+    reason: str
+    tilt: float = math.nan
+    position: int = 0
+    panels: tuple[DarkPanel, ...] = ()
+    light: PlateLight | None = None
+
+    def corrected(self, head: HeadModel) -> HeadModel:
+        """The head as designed with the dark-field panels as found."""
+        if not self.panels:
+            return head
+        return corrected(head, np.stack([panel.correction for panel in self.panels]),
+                         'dark_field')
+
+    def poses(self, head: HeadModel) -> list[PanelPose]:
+        """The panels as found, E, N, W, S; a failed one as designed. None without pictures."""
+        if not self.panels:
+            return []
+        ring = PanelRing(self.corrected(head).dark_field)
+        return [ring.pose(name, self.tilt) for name in DIRECTIONS]  # type: ignore[arg-type]
+
+
+def has_dark_field(stack: Stack) -> bool:
+    """Whether a stack has a picture of a single dark-field panel."""
+    return any(light.mode == Mode.DARK_FIELD and light.is_equation for light in stack.lights)
+
+
+def calibrate_dark_field(stacks: Sequence[Stack], captures: Sequence[Sequence[NDArray]],
+                         fit: RingFit, dots_px: NDArray, head: HeadModel, target: RingTarget,
+                         camera: CameraGeometry) -> DarkField:
+    """Fit the panels of the dark field.
+
+    :param stacks: the first with pictures under single dark-field panels is used.
+    :param captures: the bright-field pictures of each, as from light_only.
+    :param fit: of the bright field.
+    :param dots_px: (F, 2) dots of the target in the bright-field pictures.
+    :param head: as designed.
+    """
+    position = next((k for k, stack in enumerate(stacks) if has_dark_field(stack)), None)
+    if position is None:
+        return DarkField('NONE', 'no pictures of the dark-field panels; they keep the geometry of '
+                                 'the head file')
+    stack = stacks[position]
+    pictures, burnt, reasons = _pictures(stack, dots_px, target, camera)
+    tilt = next(stated_tilt(light) for light in stack.lights
+                if light.mode == Mode.DARK_FIELD and light.is_equation)
+    ring = PanelRing(corrected(head, fit.panels).bright_field)
+    bright = [ring.pose(name, fit.tilts[position]) for name in DIRECTIONS]  # type: ignore
+    mean = float(np.mean([panel.intensity for panel in bright]))
+    bright = [replace(panel, intensity=panel.intensity / mean) for panel in bright]
+    light = measure_plate_light(pictures, burnt, np.sum(captures[position][:4], axis=0), bright,
+                                fit.pose, target, camera)
+    dark = PanelRing(head.dark_field)
+    nominal = [dark.pose(name, tilt) for name in DIRECTIONS]  # type: ignore[arg-type]
+    designed = np.stack([light.mean_light(fit.pose.panel_to_target(panel), target)
+                         for panel in nominal])
+    gains = np.nansum(light.values, axis=1) / np.nansum(
+        np.where(np.isfinite(light.values), designed, math.nan), axis=1)
+    for i, reason in enumerate(reasons):
+        reasons[i] = reason or _refused(i, light, designed, gains)
+    usual = float(np.median([gain for gain, reason in zip(gains, reasons, strict=True)
+                             if not reason] or [1.0]))
+    panels = tuple(
+        DarkPanel('FAILED', reason) if reason
+        else _fit_panel(i, light, tilt, math.log(usual), fit.pose, head, target, camera)
+        for i, reason in enumerate(reasons))
+    return DarkField(*_judge(panels), tilt, position, panels, light)
+
+
+def _pictures(stack: Stack, dots_px: NDArray, target: RingTarget, camera: CameraGeometry,
+              ) -> tuple[list[NDArray], list[NDArray], list[str]]:
+    """E, N, W, S without the light of the room, where they are saturated, and what is wrong."""
+    pictures, burnt, reasons = [], [], []
+    for panel in (Panel.E, Panel.N, Panel.W, Panel.S):
+        reason = ''
+        try:
+            picture, white = without_room(stack, panel, Mode.DARK_FIELD)
+            if white.mean() > _BURNT:
+                reason = 'its picture is saturated; lower its exposure'
+            elif displacement(picture, dots_px, target, camera) > MOVED_PX:
+                reason = 'the target moved in its picture; keep head and target still'
+        except PsError:
+            reason = 'its picture is missing'
+            picture, white = np.zeros(stack.shape, np.float32), np.zeros(stack.shape, bool)
+        pictures.append(picture)
+        burnt.append(white)
+        reasons.append(reason)
+    return pictures, burnt, reasons
+
+
+def _refused(i: int, light: PlateLight, designed: NDArray, gains: NDArray) -> str:
+    """Why a panel's picture cannot be its own; empty if it can."""
+    if not gains[i] > _DEAD * np.median(gains):
+        return 'it gives no light, or its picture was taken without it; check its cable and LEDs'
+    known = np.isfinite(light.values[i])
+    likeness = np.corrcoef(light.values[i, known], designed[:, known])[0, 1:]
+    best = int(likeness.argmax())
+    if best != i:
+        return (f'its picture shows the light of panel {DIRECTIONS[best]}; check the cables of '
+                'the panels')
+    return ''
+
+
+def _judge(panels: Sequence[DarkPanel]) -> tuple[str, str]:
+    """Of all four, with what is wrong with each."""
+    reasons = [f'dark-field panel {name}: {panel.reason}'
+               + ('' if panel.calibrated else f'; {NOMINAL}')
+               for name, panel in zip(DIRECTIONS, panels, strict=True) if panel.reason]
+    if all(panel.verdict == 'OK' for panel in panels):
+        return 'OK', ''
+    return ('POOR' if any(panel.calibrated for panel in panels) else 'FAILED'), '; '.join(reasons)
+
+
+class _Problem:
+    """Residuals of one panel's light, and their derivatives, as functions of its parameters."""
+
+    def __init__(self, i: int, light: PlateLight, tilt: float, usual: float, pose: TargetPose,
+                 head: HeadModel, target: RingTarget) -> None:
+        self.i, self.tilt, self.pose, self.head, self.target = i, tilt, pose, head, target
+        known = np.isfinite(light.values[i])
+        self.points, self.values = light.points[known], light.values[i, known]
+        self.start = np.array([*[0.0] * 5, usual])
+        free = free_light(self.panel(self.start), self.points)
+        self.noise = np.hypot(light.noise[i, known], _MODEL * free)
+
+    def panel(self, x: NDArray) -> PanelPose:
+        """In the target frame."""
+        rows = np.zeros((4, PER_PANEL))
+        rows[self.i] = x
+        ring = PanelRing(corrected(self.head, rows, 'dark_field').dark_field)
+        return self.pose.panel_to_target(
+            ring.pose(DIRECTIONS[self.i], self.tilt))  # type: ignore[arg-type]
+
+    def left(self, x: NDArray) -> NDArray:
+        """Measured minus predicted, relative to the noise."""
+        light = light_of(self.panel(x), self.points, self.target)
+        return np.asarray((self.values - light) / self.noise)
+
+    def residuals(self, x: NDArray) -> NDArray:
+        return np.concatenate([_SOFT * soft(-self.left(x) / _SOFT)[0],
+                               (x - self.start) / _PRIOR])
+
+    def jacobian(self, x: NDArray) -> NDArray:
+        panel = self.panel(x)
+        light, by_motion = light_and_rates(self.points, panel, self.target.height,
+                                           self.target.footprint)
+        slope = soft((light * panel.intensity - self.values) / self.noise / _SOFT)[1] / self.noise
+        columns = []
+        for k in range(PER_PANEL - 1):
+            step = 0.1 * _STEPS[k]
+            moved = self.panel(x + step * np.eye(PER_PANEL)[k])
+            columns.append(by_motion @ rigid_motion(panel, moved) / step)
+        rates = panel.intensity * slope * np.stack([*columns, light])
+        return np.concatenate([rates, np.diag(1 / _PRIOR)], axis=1).T
+
+    def solve(self, x: NDArray) -> OptimizeResult:
+        return least_squares(self.residuals, x, self.jacobian, method='lm', max_nfev=30,
+                             x_scale=10 * _STEPS, xtol=1e-8, ftol=1e-6)
+
+
+def _fit_panel(i: int, light: PlateLight, tilt: float, usual: float, pose: TargetPose,
+               head: HeadModel, target: RingTarget, camera: CameraGeometry) -> DarkPanel:
+    """Fit one panel.
+
+    :param usual: logarithm of the intensity to start from.
+    """
+    problem = _Problem(i, light, tilt, usual, pose, head, target)
+    fit = problem.solve(problem.start)
+    # what averaging over a block adds to the light in its middle
+    known = np.isfinite(light.values[i])
+    panel = problem.panel(fit.x)
+    problem.values = problem.values - (
+        light.mean_light(panel, target)[known] - light_of(panel, problem.points, target))
+    fit = problem.solve(fit.x)
+    x, panel = fit.x, problem.panel(fit.x)
+    left = problem.left(x)
+    scatter = max(1.4826 * float(np.median(abs(left))), 1.0)
+    covariance = np.linalg.inv(fit.jac.T @ fit.jac) * scatter**2
+    free = free_light(panel, problem.points)
+    seen = light_of(panel, problem.points, target) / free
+    shaded = int(np.sum((seen > _SOFT_SHADOW[0]) & (seen < _SOFT_SHADOW[1])))
+    residuals = np.full(len(known), math.nan)
+    residuals[known] = left * problem.noise / free
+    pitch = camera.camera_standoff / camera.fx
+    found = DarkPanel('OK', '', x, covariance, shaded, residuals,
+                      _edge(problem, panel, left) / pitch, scatter)
+    astray = out_of_place(x[:5])
+    if found.rms > _FAILED_RMS or astray:
+        return DarkPanel('FAILED', 'it would be far out of its place; check its mounting' if astray
+                         else f'its shadows do not fit (residual {found.rms:.3f})',
+                         residuals=residuals, shaded=shaded)
+    if found.rms > _POOR_RMS:
+        return DarkPanel('POOR', f'its light fits badly (residual {found.rms:.3f}); clean the '
+                         'target and keep other light away', *list(vars(found).values())[2:])
+    return found
+
+
+def _edge(problem: _Problem, panel: PanelPose, left: NDArray) -> float:
+    """What is left, as a shift of the shadow edges, m."""
+    here = light_of(panel, problem.points, problem.target)
+    slopes = [(light_of(panel, problem.points + shift, problem.target) - here)
+              / _POINT_STEP for shift in _POINT_STEP * np.eye(2)]
+    steep = np.hypot(*slopes) / problem.noise
+    edges = steep > 0.3 * steep.max()
+    return float(np.sqrt(np.sum(left[edges]**2) / np.sum(steep[edges]**2)))

@@ -1,6 +1,5 @@
 """What a calibration changes: one part, reconstructed as designed and as calibrated."""
 from dataclasses import dataclass, replace
-import math
 
 import cv2
 import numpy as np

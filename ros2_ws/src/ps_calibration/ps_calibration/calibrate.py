@@ -61,7 +61,8 @@ class Calibration:
     z_scale: float = 1.0
     timings_s: dict[str, float] = field(default_factory=dict)
     shares: list[Shares] = field(default_factory=list)
-    dark: DarkField = DarkField('NONE', 'the bright field comes first')
+    dark: DarkField = field(
+        default_factory=lambda: DarkField('NONE', 'the bright field comes first'))
 
     @property
     def full_reason(self) -> str:
@@ -152,8 +153,8 @@ def head_calibration(result: Calibration, head: HeadModel, target: RingTarget,
         'head_serial': head_serial, 'camera': result.camera, 'plane_normal': plane.normal,
         'plane_offset': plane.offset, 'panels': corrections, 'z_scale': result.z_scale,
         'dark_field': _record(result.dark),
-        'verdict': result.verdict, 'verdict_reason': result.full_reason, 'target_name': target.name,
-        'software_version': _version()})
+        'verdict': result.verdict, 'verdict_reason': result.full_reason,
+        'target_name': target.name, 'software_version': _version()})
 
 
 def _correction(p: NDArray, usual: float, edge_px: float) -> PanelCorrection:

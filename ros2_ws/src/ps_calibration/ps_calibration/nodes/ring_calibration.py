@@ -260,7 +260,8 @@ class RingCalibration(Node):
                     self._feedback(goal, state.MOVING if moving else state.CAPTURING, number,
                                    len(radii), hint)
                 stack = self._source.take(
-                    AcquireStack.Goal(steps=self._steps(radius, number == 0), part_id='ring calibration'),
+                    AcquireStack.Goal(steps=self._steps(radius, number == 0),
+                                      part_id='ring calibration'),
                     self.parameters['capture_timeout'], self._cancelled.is_set, on_feedback)
                 if keep is not None:
                     _keep(stack, keep / f'position_{number + 1}')

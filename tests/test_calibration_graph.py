@@ -18,12 +18,13 @@ import yaml
 from ps_calibration.graph import NODES as CALIBRATION_NODES
 from ps_calibration.ring_fit import corrected
 from ps_calibration.ring_target import default_target_path, load_target
-from ps_calibration.synthetic import Bench, errors_of, solid_of
+from ps_calibration.synthetic import Bench, dark_errors, errors_of, panels_off, solid_of
 from ps_head_driver.calibration_file import HeadCalibration as HeadCalibrationFile
 from ps_head_driver.calibration_file import apply, read_calibration, write_calibration
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.fake.ring_renderer import RingSolid, placement
 from ps_head_driver.graph import NODES as HEAD_NODES
+from ps_head_driver.head_client import PANEL_NAMES
 from ps_head_driver.head_model import load_head, nominal_head_path
 from ps_head_driver.stack import Plane
 from ps_head_driver.stack_folder import read_stack
@@ -40,11 +41,10 @@ STATE = CalibrateRing.Feedback
 
 
 def true_head():
-    """Panels off by up to 3 mm, 2 degrees and 5 %."""
+    """Panels of both fields off by up to 3 mm, 2 degrees and 5 %."""
     random = np.random.default_rng(12)
-    return corrected(NOMINAL, np.concatenate([
-        random.uniform(-0.003, 0.003, (4, 3)), np.radians(random.uniform(-2, 2, (4, 2))),
-        np.log(random.uniform(0.95, 1.05, (4, 1)))], axis=1))
+    head = corrected(NOMINAL, panels_off(random))
+    return corrected(head, panels_off(random), 'dark_field')
 
 
 @pytest.fixture(scope='module')
@@ -152,12 +152,16 @@ def test_calibration_brings_the_lights_closer_to_the_truth(
     after = errors_of(apply(NOMINAL, calibration), plane, bench, tilt)
     assert after.direction_deg.max() < 0.15 < before.direction_deg.max()
     assert np.abs(after.intensity).max() < 0.01 < np.abs(before.intensity).max()
+    assert {panel.name for panel in result.calibration.panels} == set(PANEL_NAMES)
+    grazing = [dark_errors(head, bench).direction_deg.max()
+               for head in (NOMINAL, apply(NOMINAL, calibration))]
+    assert grazing[1] < 0.15 < grazing[0]
     assert after.level_deg < 0.06 < before.level_deg
     assert client.stack(client.capture()).calibration_id == identifier
 
     page = (folder / 'files' / f'{identifier}.html').read_text()
     assert identifier in page
-    assert page.count('<figure') == 14      # pictures, shadows, residuals, height of the ring
+    assert page.count('<figure') == 26      # pictures, shadows, residuals of both fields, height
     listed = client.call(Trigger, 'ring_calibration/list').message
     assert f'{identifier}.yaml  OK' in listed
     assert listed.endswith('(active)')

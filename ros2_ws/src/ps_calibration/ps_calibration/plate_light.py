@@ -23,6 +23,7 @@ from ps_head_driver.kinematics import PanelPose
 _BLOCK = 3.2e-4          # m on the plate, edge of the blocks of pixels
 _PART, _ROW = 4, 3       # one block in so many is used, on a lattice that moves so much per row
 _FAINT = 0.05            # of the median light: below it noise falls no more
+_DARKNESS = 1e-9
 _CHI2_MEDIAN = 0.4549    # median of a squared standard normal variable
 
 
@@ -98,7 +99,7 @@ def _noise(ratio: NDArray, used: NDArray) -> NDArray:
 
     Shot noise: the variance is proportional to the light.
     """
-    level = np.maximum(ratio, _FAINT * np.median(ratio[used]))
+    level = np.maximum(ratio, max(_FAINT * float(np.median(ratio[used])), _DARKNESS))
     change = np.diff(ratio, 2, axis=1)
     seen = used[:, 1:-1] & np.isfinite(change)
     gain = np.median(change[seen]**2 / (6 * level[:, 1:-1][seen])) / _CHI2_MEDIAN

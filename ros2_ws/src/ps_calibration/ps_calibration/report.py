@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ps_calibration import report_figures as figures
 from ps_calibration.before_after import Comparison
 from ps_calibration.calibrate import Calibration, head_calibration
+from ps_calibration.dark_field_report import dark_field_section
 from ps_calibration.motor_calibration import MotorCalibration
 from ps_calibration.repeatability import Repeatability, repeatability, repeats
+from ps_calibration.report_parts import figure, single_pictures
 from ps_calibration.ring_height import height_map, wall_height
 from ps_calibration.ring_pictures import light_only
 from ps_calibration.ring_target import RingTarget
@@ -28,8 +29,8 @@ from ps_calibration.uncertainty import light_figures
 from ps_head_driver.calibration_file import HeadCalibration, new_calibration_id
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import DIRECTIONS, HeadModel
-from ps_head_driver.stack import Panel, Stack
-from ps_reconstruction.html_report import data_uri, page, png_bytes, shrink
+from ps_head_driver.stack import Mode, Stack
+from ps_reconstruction.html_report import page
 
 _MEANING = {
     'OK': 'The pictures fit the target, and the result can be used.',
@@ -111,16 +112,18 @@ def report(evidence: Evidence) -> str:
     result = evidence.result
     sections: dict[str, Any] = {
         'pictures': [], 'shadows': [], 'residuals': [], 'ring': [], 'parts': [], 'lights': [],
-        'corrections': [], 'tables': [_provenance(evidence)], 'shown': ''}
+        'corrections': [], 'dark': None, 'tables': [_provenance(evidence)], 'shown': ''}
     if evidence.stacks:
         shown = _most_doubtful(result)
         sections['shown'] = evidence.names[shown] if len(evidence.stacks) > 1 else ''
-        sections['pictures'] = _pictures(evidence.stacks[shown])
+        sections['pictures'] = single_pictures(evidence.stacks[shown], Mode.BRIGHT_FIELD)
         if result.fit is not None:
             sections |= _shadows(evidence, shown)
             sections['ring'] = _ring(evidence, shown)
             sections['lights'] = _lights(evidence)
             sections['corrections'] = _corrections(evidence)
+            sections['dark'] = dark_field_section(result, evidence.stacks, evidence.head,
+                                                  evidence.target)
             sections['parts'] = [_part(part) for part in evidence.parts]
             sections['tables'] = [_quality(evidence), *_repeats(evidence), *_motor(evidence),
                                   _provenance(evidence)]
@@ -141,25 +144,6 @@ def _most_doubtful(result: Calibration) -> int:
     return int(np.argmax([float(np.max(edges)) for edges in result.fit.edge_px]))
 
 
-def _figure(name: str, svg: bytes, caption: str) -> dict[str, str]:
-    return {'name': name, 'uri': data_uri(svg, 'svg+xml'), 'caption': caption}
-
-
-def _picture(name: str, image: NDArray, width: int, caption: str = '') -> dict[str, str]:
-    return {'name': name, 'uri': data_uri(png_bytes(shrink(image, width))), 'caption': caption}
-
-
-def _pictures(stack: Stack) -> list[dict[str, str]]:
-    found = []
-    for panel in (Panel.E, Panel.N, Panel.W, Panel.S):
-        for image, light in zip(stack.images, stack.lights, strict=True):
-            if light.panel == panel:
-                full = float(np.percentile(image, 99.8)) or 1.0
-                grey = (np.clip(image / full, 0, 1) * 255).astype(np.uint8)
-                found.append(_picture(panel.name, grey, 560))
-    return found
-
-
 def _shadows(evidence: Evidence, position: int) -> dict[str, list[dict[str, str]]]:
     fit, camera = evidence.result.fit, evidence.result.camera
     assert fit is not None
@@ -168,11 +152,11 @@ def _shadows(evidence: Evidence, position: int) -> dict[str, list[dict[str, str]
     maps = shadow_maps(*place)
     shares, left = evidence.result.shares[position], fit.residuals[position]
     return {
-        'shadows': [_figure(
+        'shadows': [figure(
             name, figures.shadow(i, maps, edge_profile(i, *place)),
             f'edges off by {fit.edge_px[position][i]:.3f} px (RMS)')
             for i, name in enumerate(DIRECTIONS)],
-        'residuals': [_figure(
+        'residuals': [figure(
             name, figures.residuals(shares.pixels, left[i], camera),
             f'RMS {1e3 * float(np.sqrt(np.mean(left[i]**2))):.2f} thousandths')
             for i, name in enumerate(DIRECTIONS)]}
@@ -183,7 +167,7 @@ def _ring(evidence: Evidence, position: int) -> list[dict[str, str]]:
     assert result.fit is not None
     heights = wall_height(result.fit, head, target, result.camera, result.shares)
     spread = float(np.nanstd(heights.height))
-    found = [_figure(
+    found = [figure(
         'Height of the wall from its shadows', figures.wall(heights, target),
         f'known {1e3 * target.height:.3f} mm, fitted as a whole '
         f'{1e3 * target.height / result.z_scale:.3f} mm; along the arc it varies by '
@@ -192,7 +176,7 @@ def _ring(evidence: Evidence, position: int) -> list[dict[str, str]]:
         stack = evidence.stacks[position]
         before = height_map(stack, result.fit, head, target, None)
         after = height_map(stack, result.fit, head, target, evidence.calibration)
-        found.append(_figure(
+        found.append(figure(
             'Reconstructed height, normalised', figures.ring_height(after),
             f"the plate is flat to {100 * after.flatness:.2f} % of the wall's height "
             f'({1e6 * after.flatness * target.height:.0f} µm RMS; before the calibration '
@@ -218,13 +202,13 @@ def _part(part: Comparison) -> dict[str, Any]:
         if all(map(math.isfinite, values)):
             digits = 1 if unit == ' µm' else 2 if unit == ' %' else 3
             rows.append([name, *(f'{value:.{digits}f}{unit}' for value in values)])
-    views = [_figure(name, figures.part_height(
+    views = [figure(name, figures.part_height(
         outcome.height - np.nanmedian(outcome.height), low - margin, high + margin), caption)
         for name, outcome, caption in (
             ('Before', before, 'least squares with the lights as designed'),
             ('After', after, 'least squares with the lights as calibrated'),
             ('After, STV', part.after['stv'], 'robust against gloss'))]
-    views.append(_figure('Cross-section', figures.cross_section(part),
+    views.append(figure('Cross-section', figures.cross_section(part),
                          'along the middle row of the picture'))
     return {'name': part.name, 'rows': rows, 'views': views}
 

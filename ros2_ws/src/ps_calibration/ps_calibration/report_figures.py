@@ -57,11 +57,36 @@ def shadow(panel: int, maps: ShadowMaps, profile: EdgeProfile) -> bytes:
 
 
 @_styled
-def residuals(pixels: NDArray, residual: NDArray, camera: CameraGeometry) -> bytes:
-    """Measured minus fitted share of one panel at (N, 2) pixels, in thousandths."""
+def grazing_shadow(points: NDArray, measured: NDArray, x: NDArray, y: NDArray,
+                   fitted: NDArray) -> bytes:
+    """How much of a dark-field panel is seen from the plate, with the fitted edges.
+
+    :param points: (N, 2) where it was measured, target frame, m.
+    :param measured: (N,) 1 is all of it; NaN is left out.
+    :param x, y: (w,), (h,) of the fit's grid, m.
+    :param fitted: (h, w).
+    """
+    figure, (ax,) = _axes(1, (4.2, 3.8))
+    ax.set_facecolor('#8a7f70')
+    known = np.isfinite(measured)
+    shown = 1e3 * points[known]
+    ax.scatter(shown[:, 0], shown[:, 1], c=measured[known], s=24.0, cmap='gray', vmin=0, vmax=1.05,
+               linewidths=0, marker='s', rasterized=True)
+    for level, style in ((0.1, ':'), (0.5, '-'), (0.9, ':')):
+        ax.contour(1e3 * x, 1e3 * y, fitted, [level], colors=_FIT, linestyles=style,
+                   linewidths=1.2 if level == 0.5 else 0.9)
+    ax.set(xlabel='x, mm', ylabel='y, mm', aspect='equal',
+           xlim=1e3 * x[[0, -1]], ylim=1e3 * y[[0, -1]])
+    return _svg(figure)
+
+
+@_styled
+def residuals(pixels: NDArray, residual: NDArray, camera: CameraGeometry,
+              most: float = 5.0) -> bytes:
+    """Measured minus fitted share of one panel at (N, 2) pixels, up to ``most`` thousandths."""
     figure, (ax,) = _axes(1, (3.0, 2.5))
     shown = ax.scatter(pixels[:, 0], pixels[:, 1], c=1e3 * residual, s=2.0, cmap='RdBu_r',
-                       vmin=-5, vmax=5, linewidths=0, rasterized=True)
+                       vmin=-most, vmax=most, linewidths=0, rasterized=True)
     ax.set_facecolor('#80808030')
     ax.set(xlim=(0, camera.width_px), ylim=(camera.height_px, 0), aspect='equal',
            xticks=[], yticks=[])

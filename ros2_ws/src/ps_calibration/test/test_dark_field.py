@@ -11,8 +11,9 @@ import pytest
 
 from ps_calibration.calibrate import Calibration, calibrate, head_calibration
 from ps_calibration.cli.ps_calibrate import dark_field_as_json
-from ps_calibration.dark_field import PARAMETERS, calibrate_dark_field
+from ps_calibration.dark_field import PARAMETERS, calibrate_dark_field, fit_panel
 from ps_calibration.dark_field_report import dark_field_section
+from ps_calibration.plate_light import free_light, light_of
 from ps_calibration.report import Evidence
 from ps_calibration.ring_pictures import light_only, locate, stated_tilt
 from ps_calibration.ring_target import RingTarget
@@ -63,6 +64,23 @@ def test_panels_are_found_where_they_are(
         assert error < 5 * np.degrees(figure.direction_deviation) + 0.02
         assert panel.source == 'shadows'
         assert panel.seen.all()
+
+
+def test_where_no_shadow_is_seen_the_fall_off_over_the_plate_tells(
+        result: Calibration, bench: Bench, target: RingTarget, nominal: HeadModel) -> None:
+    dark, pose = result.dark, result.fit.pose
+    free = [free_light(pose.panel_to_target(panel), dark.light.points)
+            for panel in dark.poses(nominal)]
+    lit = np.stack([light_of(pose.panel_to_target(panel), dark.light.points, target)
+                    for panel in dark.poses(nominal)]) > 0.999 * np.stack(free)
+    unshaded = replace(dark.light, values=np.where(lit, dark.light.values, np.nan))
+    panels = tuple(fit_panel(i, unshaded, dark.tilt, 0.0, pose, nominal, target, result.camera)
+                   for i in range(4))
+    assert {panel.source for panel in panels} == {'plate'}
+    errors = dark_errors(replace(dark, panels=panels).corrected(nominal), bench)
+    assert errors.direction_deg.max() < 0.6 < dark_errors(nominal, bench).direction_deg.min()
+    for alone, whole in zip(panels, dark.panels, strict=True):
+        assert np.all(alone.deviation > whole.deviation)
 
 
 def test_file_json_and_report_carry_the_dark_field(

@@ -23,6 +23,7 @@ class Phase(IntEnum):
     FAULT = 6
 
 
+HANDOVER = 0.5     # s that a request waits for an operation whose motion has ended
 _PHASES = {Activity.HOMING: Phase.HOMING, Activity.MOVING: Phase.MOVING,
            Activity.STOPPING: Phase.MOVING, Activity.STROBING: Phase.STROBING}
 
@@ -144,7 +145,9 @@ class HeadSupervisor:
         :param homed: whether the operation needs the motor's position.
         :raises PsError: HEAD_DISCONNECTED, HEAD_BUSY, HEAD_NOT_HOMED.
         """
-        with self._alone():
+        # READY is said when the head reports it: the operation that ends has the head a bit longer
+        idle = self._state is not None and self._state.activity is Activity.IDLE
+        with self._alone(wait=HANDOVER if idle else 0.0):
             self.check_connected()
             if homed and not (self._state and self._state.homed):
                 raise PsError(ErrorCode.HEAD_NOT_HOMED,

@@ -156,3 +156,29 @@ def test_limit_switch(cell: Cell) -> None:
     assert recover(supervisor) < RECOVERY_S
     with supervisor.operation(homed=True) as client:
         assert client.move_to(1000, FAST).motor_counts == 1000
+
+
+@pytest.mark.parametrize(('held_s', 'code'), [(0.2, None), (1.5, ErrorCode.HEAD_BUSY)])
+def test_who_read_ready_is_let_in_when_the_operation_ends(
+        cell: Cell, held_s: float, code: ErrorCode | None) -> None:
+    supervisor, _ = cell
+    recover(supervisor)
+    taken = threading.Event()
+
+    def hold() -> None:
+        with supervisor.operation():
+            taken.set()
+            time.sleep(held_s)
+
+    holder = threading.Thread(target=hold)
+    holder.start()
+    assert taken.wait(2.0)
+    assert supervisor.snapshot().phase is Phase.READY       # what a client is told
+    found = None
+    try:
+        with supervisor.operation():
+            pass
+    except PsError as error:
+        found = error.code
+    holder.join()
+    assert found is code

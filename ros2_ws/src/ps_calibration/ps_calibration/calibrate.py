@@ -50,6 +50,7 @@ class Calibration:
     :param reason: of a verdict that is not OK, and what to do.
     :param fit: None if it failed before the fit.
     :param z_scale: known height of the wall over the one fitted.
+    :param z_scale_deviation: standard deviation of it that noise makes.
     :param shares: what was fitted, per motor position.
     :param dark: of the dark-field panels, judged apart: verdict and reason are not about them.
     """
@@ -59,6 +60,7 @@ class Calibration:
     camera: CameraGeometry
     fit: RingFit | None = None
     z_scale: float = 1.0
+    z_scale_deviation: float = 0.0
     timings_s: dict[str, float] = field(default_factory=dict)
     shares: list[Shares] = field(default_factory=list)
     dark: DarkField = field(
@@ -124,8 +126,8 @@ def calibrate(stacks: Sequence[Stack], target: RingTarget, head: HeadModel) -> C
     names = list(clock)
     timings = {name: clock[name] - clock[before]
                for before, name in pairwise(names)}
-    return Calibration(verdict, reason, camera, fit, z_scale, timings, shares,
-                       dark)
+    deviation = z_scale * free.height_deviation / max(free.height, 1e-2 * target.height)
+    return Calibration(verdict, reason, camera, fit, z_scale, deviation, timings, shares, dark)
 
 
 def head_calibration(result: Calibration, head: HeadModel, target: RingTarget,

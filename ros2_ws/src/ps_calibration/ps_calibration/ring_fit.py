@@ -6,7 +6,7 @@ remain. All motor positions, all panels and the target's pose are fitted togethe
 loss, starting from the kinematics. ring_problem.py says what is expected of the pictures.
 """
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from ps_head_driver.head_model import CameraGeometry, HeadModel
 __all__ = ['PER_PANEL', 'RingFit', 'blocked_slits', 'corrected', 'fit_ring', 'predicted_shares']
 
 _THIN = 6                # one block in so many gets the fit close
+_CLOSE = 0.05            # heights of the wall, relative, between which one step is enough
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class RingFit:
     :param tilts: per position, rad, nominal plus the fitted error of the motor.
     :param pose: of the target.
     :param height: of the wall, m: fitted or as given.
+    :param height_deviation: its standard deviation, 0 if it was given.
     :param softness: of the pictures: variance of their blur over that of the blocks.
     :param residuals: per position (4, N) measured minus predicted share.
     :param edge_px: per position (4,) what the residuals amount to as a shift of the shadow edges.
@@ -48,6 +50,7 @@ class RingFit:
     tilts: list[float]
     pose: TargetPose
     height: float
+    height_deviation: float
     softness: float
     residuals: list[NDArray]
     edge_px: list[NDArray]
@@ -80,7 +83,9 @@ def fit_ring(head: HeadModel, target: RingTarget, camera: CameraGeometry,
         problem.learn_blur(x)
     fit = _solve(problem, x)
     if free_height:
-        return _summary(problem, fit.x, fit.jac)
+        found = _summary(problem, fit.x, fit.jac)
+        near = start is not None and abs(found.height / target.height - 1) < _CLOSE
+        return _whole_height(found, head, target, camera, shares, dots_px) if near else found
     # what remains tells how far to trust the shadows and the rest
     problem = RingProblem(head, target, camera, [
         share.reweighed(difference)
@@ -88,6 +93,20 @@ def fit_ring(head: HeadModel, target: RingTarget, camera: CameraGeometry,
     problem.learn_blur(fit.x)
     fit = _solve(problem, fit.x)
     return _summary(problem, fit.x, fit.jac)
+
+
+def _whole_height(found: RingFit, head: HeadModel, target: RingTarget, camera: CameraGeometry,
+                  shares: Sequence[Shares], dots_px: NDArray) -> RingFit:
+    """A fit with a free wall height, the height improved by one step with all the blocks."""
+    problem = RingProblem(head, target, camera, shares, dots_px, free_height=True)
+    x = problem.start(found.panels, found.pose, found.tilts, found.softness)
+    x[-1] = found.height
+    problem.learn_blur(x)
+    jacobian = problem.jacobian(x)
+    inverse = np.linalg.pinv(jacobian.T @ jacobian)
+    step = -inverse @ jacobian.T @ problem.residuals(x)
+    return replace(found, height=found.height + float(step[-1]),
+                   height_deviation=found.scatter * float(np.sqrt(inverse[-1, -1])))
 
 
 def _solve(problem: RingProblem, x: NDArray) -> OptimizeResult:
@@ -119,7 +138,8 @@ def _summary(problem: RingProblem, x: NDArray, jacobian: NDArray) -> RingFit:
     scaled = jacobian / np.maximum(lengths, 1e-300)
     strengths = np.sqrt(np.linalg.eigvalsh(scaled.T @ scaled)[::-1].clip(min=1e-30))
     return RingFit(panels, [problem.tilt(x, k) for k in range(len(residuals))], problem.pose(x),
-                   problem.height(x), float(x[problem.softness]), residuals, edge_px, scatter,
+                   problem.height(x), float(deviation[-1]) if problem.free_height else 0.0,
+                   float(x[problem.softness]), residuals, edge_px, scatter,
                    deviation[:4 * PER_PANEL].reshape(4, PER_PANEL),
                    deviation[4 * PER_PANEL:problem.first_tilt],
                    covariance[:problem.first_tilt, :problem.first_tilt],

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from ps_calibration.detection import find_dots
 from ps_calibration.ring_target import RingTarget
@@ -18,7 +19,9 @@ from ps_head_driver.stack import Light, Mode, Panel, Stack
 _SATURATED = 0.002       # part of the pixels at the end of the range
 _DARK = 0.05             # mean of a picture, relative to the end of its range
 _DEAD = 0.3              # of the mean of the four panels
-MOVED_PX = 0.3          # of a dot, between two pictures
+MOVED_PX = 0.3           # of a dot, between two pictures
+_TILE_PX = 64            # in which a dark picture's noise and mean are alike
+_NO_ROUNDING = 0.7       # grey values; with more noise, rounding leaves means alone
 
 
 def common_camera(stacks: Sequence[Stack], head: HeadModel) -> CameraGeometry:
@@ -71,6 +74,36 @@ def _frame(stack: Stack, panel: Panel, mode: Mode) -> tuple[NDArray, float]:
                   'calibration needs E, N, W, S, ALL and NONE')
 
 
+def unrounded(picture: NDArray) -> NDArray:
+    """A dark picture without what rounding to whole grey values does to its mean.
+
+    With less noise than half a grey value, means are drawn towards whole values, by up to a
+    quarter of one. Subtracted from all four panels, 0.04 of 255 grey values too few look like a
+    turn of the panels of 0.05 degrees. In tiles, a normal distribution is put through the parts
+    of the pixels below and above the most common value.
+
+    :param picture: (H, W, ...) of whole grey values; others are returned as they are.
+    :returns: float32.
+    """
+    out: NDArray = picture.astype(np.float32)
+    if not np.issubdtype(picture.dtype, np.integer):
+        return out
+    for row in range(0, picture.shape[0], _TILE_PX):
+        for column in range(0, picture.shape[1], _TILE_PX):
+            here = (slice(row, row + _TILE_PX), slice(column, column + _TILE_PX))
+            tile = out[here]
+            middle = float(np.median(tile))
+            low, high = np.mean(tile < middle - 0.25), np.mean(tile <= middle + 0.25)
+            alike = abs(tile - middle) < 2.5
+            if not (0 < low < high < 1) or not alike.any():
+                continue
+            first, last = ndtri(low), ndtri(high)
+            if last - first > 1 / _NO_ROUNDING:
+                mean = middle + 0.5 - last / (last - first)
+                tile[alike] += mean - tile[alike].mean()
+    return out
+
+
 def without_room(stack: Stack, panel: Panel, mode: Mode = Mode.BRIGHT_FIELD,
                  ) -> tuple[NDArray, NDArray]:
     """One frame at unit exposure without the light of the room, and where it is saturated.
@@ -81,7 +114,7 @@ def without_room(stack: Stack, panel: Panel, mode: Mode = Mode.BRIGHT_FIELD,
     image, scale = _frame(stack, panel, mode)
     dark, dark_scale = _frame(stack, Panel.NONE, Mode.BRIGHT_FIELD)
     # the room shines for as long as the shutter is open
-    grey = image.astype(np.float32) / scale - dark.astype(np.float32) / dark_scale
+    grey = image.astype(np.float32) / scale - unrounded(dark) / dark_scale
     burnt: NDArray = np.asarray(image >= _range_of(stack.images))
     if grey.ndim == 3:
         return grey.mean(axis=-1), np.asarray(burnt.any(axis=-1))

@@ -22,6 +22,7 @@ from ps_head_driver.light_model import light_vectors
 from ps_head_driver.stack import Light, Panel, Plane, Stack, Truth, angular_error_deg
 
 _LENS = (-0.05, 0.0, 0.0, 0.0, 0.0)     # a pixel or so in the corners of the picture
+_SENSOR = Sensor(ambient=0.02, vignetting=0.1)
 
 _DARK_FIELD = 8                         # draws the dark field apart, the rest stays as it is
 DF_TILT = 1.3                           # rad, where the servo stands after power-up
@@ -72,7 +73,7 @@ def panels_off(random: np.random.Generator) -> NDArray:
 
 def render_stack(bench: Bench, nominal: HeadModel, solid: RingSolid, m_counts: int,
                  scale: float = 1.0, seed: int = 1, tilt: float | None = None,
-                 dark_field: bool = False) -> Stack:
+                 dark_field: bool = False, sensor: Sensor = _SENSOR) -> Stack:
     """The six pictures of one motor position, labelled with the nominal lights.
 
     :param m_counts: of the encoder.
@@ -80,7 +81,6 @@ def render_stack(bench: Bench, nominal: HeadModel, solid: RingSolid, m_counts: i
     :param tilt: that the panels really have, rad; None: that of the nominal crank.
     :param dark_field: four more pictures, under the panels of the dark field.
     """
-    sensor = Sensor(ambient=0.02, vignetting=0.1)
     renderer = RingRenderer(solid, bench.where, bench.head, sensor, scale, seed)
     if tilt is None:
         tilt = float(BrightFieldKinematics(nominal).tilt(m_counts))

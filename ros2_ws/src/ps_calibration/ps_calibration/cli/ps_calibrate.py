@@ -77,6 +77,7 @@ def as_json(evidence: Evidence, folders: list[Path]) -> dict:
         'plane': fit and {'normal': list(fit.pose.plane.normal),
                           'offset': fit.pose.plane.offset},
         'z_scale': result.z_scale if fit else None,
+        'z_scale_deviation': result.z_scale_deviation if fit else None,
         'camera_to_plane': None if homography is None else homography.tolist(),
         'dark_field': dark_field_as_json(evidence, folders),
         'condition': fit and fit.condition, 'motor': motor and _numbers(vars(motor)),
@@ -131,7 +132,7 @@ def _print(evidence: Evidence) -> None:
                                  strict=False):
         x, y, z = pose.center * 1e3
         print(f'panel DF_{name}  at ({x:.2f}, {y:.2f}, {z:.2f}) mm, from {found.source}')
-    print(f'z scale  {result.z_scale:.4f}')
+    print(f'z scale  {result.z_scale:.4f} ± {result.z_scale_deviation:.4f}')
     if motor:
         print(f'motor    offset {motor.offset_counts:.0f} counts, scale {motor.scale:.5f}, '
               f'backlash {motor.backlash_counts:.0f} counts, '

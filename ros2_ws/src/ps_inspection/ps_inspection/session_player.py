@@ -103,7 +103,8 @@ class Player:
             if message.topic.type not in self._known:
                 continue
             begin = message.log_time if begin is None else begin
-            if message.log_time < begin + self._options.start * 1e9:
+            # in whole ns: as a float, the first message may lie before its own time
+            if message.log_time < begin + round(self._options.start * 1e9):
                 if message.topic.latched:
                     state[message.topic.name] = message
                 continue

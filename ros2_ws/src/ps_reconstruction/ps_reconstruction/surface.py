@@ -49,6 +49,8 @@ def mean_curvature(normal: NDArray[np.float32], pitch: float, sigma_px: float = 
     """
     valid = np.isfinite(normal[..., 2])
     n_x, n_y = (smooth(normal[..., a], valid, sigma_px) for a in (0, 1))
+    if min(valid.shape) < 3:
+        return np.full(valid.shape, np.nan, np.float32)
     out = np.empty(valid.shape, np.float32)
     scale = np.float32(-0.25 / pitch)
     for_bands(len(out), BAND, lambda i, j: _curvature_rows(n_x, n_y, valid, scale, i, j, out))

@@ -30,6 +30,12 @@ def test_mean_curvature_of_a_sphere(sign: int) -> None:
     assert float(np.median(found)) == pytest.approx(-sign / radius, rel=0.01)
 
 
+@pytest.mark.parametrize('shape', [(1, 1), (1, 5), (2, 7), (7, 2)])
+def test_a_picture_without_inner_pixels_has_no_curvature(shape: tuple[int, int]) -> None:
+    normal = np.broadcast_to(np.float32([0, 0, 1]), (*shape, 3))
+    assert np.isnan(surface.mean_curvature(normal, PITCH)).all()
+
+
 def test_shape_image_is_bright_on_a_bump_and_dark_in_a_pit() -> None:
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:200, :240]

@@ -41,6 +41,7 @@ _THIN = 4                # one block in so many gets the fit close
 _SOFT = 3.0              # standard deviations from which on a residual counts less
 _POINT_STEP = 1e-5       # m
 _DEAD = 0.3              # of the median of the four panels
+_LIKE = 0.5              # correlation of a panel's light with that as designed
 _BURNT = 0.2             # part of the plate that may be saturated
 _SOFT_SHADOW = 0.05, 0.95        # part of a panel seen from a block in soft shadow
 _SHADED = 100            # blocks in soft shadow tell where a panel is
@@ -159,7 +160,7 @@ def calibrate_dark_field(stacks: Sequence[Stack], captures: Sequence[Sequence[ND
         return DarkField('NONE', 'no pictures of the dark-field panels; they keep the geometry of '
                                  'the head file')
     stack = stacks[position]
-    pictures, burnt, reasons = _pictures(stack, dots_px, target, camera)
+    pictures, burnt, reasons = _pictures(stack)
     tilt = next(stated_tilt(light) for light in stack.lights
                 if light.mode == Mode.DARK_FIELD and light.is_equation)
     ring = PanelRing(corrected(head, fit.panels).bright_field)
@@ -176,6 +177,9 @@ def calibrate_dark_field(stacks: Sequence[Stack], captures: Sequence[Sequence[ND
         np.where(np.isfinite(light.values), designed, math.nan), axis=1)
     for i, reason in enumerate(reasons):
         reasons[i] = reason or _refused(i, light, designed, gains)
+        # in a picture without light no dot could be found
+        if not reasons[i] and displacement(pictures[i], dots_px, target, camera) > MOVED_PX:
+            reasons[i] = 'the target moved in its picture; keep head and target still'
     usual = float(np.median([gain for gain, reason in zip(gains, reasons, strict=True)
                              if not reason] or [1.0]))
     panels = tuple(
@@ -185,8 +189,7 @@ def calibrate_dark_field(stacks: Sequence[Stack], captures: Sequence[Sequence[ND
     return DarkField(*_judge(panels), tilt, position, panels, light)
 
 
-def _pictures(stack: Stack, dots_px: NDArray, target: RingTarget, camera: CameraGeometry,
-              ) -> tuple[list[NDArray], list[NDArray], list[str]]:
+def _pictures(stack: Stack) -> tuple[list[NDArray], list[NDArray], list[str]]:
     """E, N, W, S without the light of the room, where they are saturated, and what is wrong."""
     pictures, burnt, reasons = [], [], []
     for panel in (Panel.E, Panel.N, Panel.W, Panel.S):
@@ -195,8 +198,6 @@ def _pictures(stack: Stack, dots_px: NDArray, target: RingTarget, camera: Camera
             picture, white = without_room(stack, panel, Mode.DARK_FIELD)
             if white.mean() > _BURNT:
                 reason = 'its picture is saturated; lower its exposure'
-            elif displacement(picture, dots_px, target, camera) > MOVED_PX:
-                reason = 'the target moved in its picture; keep head and target still'
         except PsError:
             reason = 'its picture is missing'
             picture, white = np.zeros(stack.shape, np.float32), np.zeros(stack.shape, bool)
@@ -208,11 +209,14 @@ def _pictures(stack: Stack, dots_px: NDArray, target: RingTarget, camera: Camera
 
 def _refused(i: int, light: PlateLight, designed: NDArray, gains: NDArray) -> str:
     """Why a panel's picture cannot be its own; empty if it can."""
+    no_light = 'it gives no light, or its picture was taken without it; check its cable and LEDs'
     if not gains[i] > _DEAD * np.median(gains):
-        return 'it gives no light, or its picture was taken without it; check its cable and LEDs'
+        return no_light
     known = np.isfinite(light.values[i])
     likeness = np.corrcoef(light.values[i, known], designed[:, known])[0, 1:]
     best = int(likeness.argmax())
+    if likeness[best] < _LIKE:              # all are dark: noise
+        return no_light
     if best != i:
         return (f'its picture shows the light of panel {DIRECTIONS[best]}; check the cables of '
                 'the panels')

@@ -10,7 +10,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from ps_calibration.dark_field import DarkField, calibrate_dark_field
+from ps_calibration.dark_field import NOT_REACHED, DarkField, calibrate_dark_field
 from ps_calibration.ring_fit import (
     RingFit,
     blocked_slits,
@@ -63,8 +63,7 @@ class Calibration:
     z_scale_deviation: float = 0.0
     timings_s: dict[str, float] = field(default_factory=dict)
     shares: list[Shares] = field(default_factory=list)
-    dark: DarkField = field(
-        default_factory=lambda: DarkField('NONE', 'the bright field comes first'))
+    dark: DarkField = NOT_REACHED
 
     @property
     def full_reason(self) -> str:
@@ -77,8 +76,7 @@ class Calibration:
         if self.fit is None:
             return []
         ring = BrightFieldKinematics(corrected(head, self.fit.panels)).ring
-        return [[ring.pose(name, tilt) for name in DIRECTIONS]  # type: ignore[arg-type]
-                for tilt in self.fit.tilts]
+        return [ring.poses(tilt) for tilt in self.fit.tilts]
 
     def camera_to_plane(self) -> NDArray | None:
         """Homography from undistorted pixels to the plane, see target_pose."""
@@ -119,7 +117,7 @@ def calibrate(stacks: Sequence[Stack], target: RingTarget, head: HeadModel) -> C
     z_scale = target.height / max(free.height, 1e-2 * target.height)
     blocked = blocked_slits(fit, head, target, camera, shares)
     verdict, reason = judge(fit, free, target, blocked)
-    dark = DarkField('NONE', 'the bright field comes first')
+    dark = NOT_REACHED
     if verdict != 'FAILED':
         dark = calibrate_dark_field(stacks, captures, fit, dots_px, head, target, camera)
         clock['dark_field'] = time.perf_counter()

@@ -17,11 +17,20 @@ from ps_calibration.plate_light import (
     PlateLight,
     free_light,
     light_of,
+    mean_light,
     measure_plate_light,
 )
 from ps_calibration.ring_fit import RingFit
-from ps_calibration.ring_pictures import MOVED_PX, stated_tilt, without_room
-from ps_calibration.ring_problem import PER_PANEL, corrected, rigid_motion
+from ps_calibration.ring_pictures import MOVED_PX, room_light, stated_tilt, without_room
+from ps_calibration.ring_problem import (
+    PANEL_PRIOR,
+    PANEL_STEPS,
+    PER_PANEL,
+    POINT_STEP,
+    SOFT,
+    corrected,
+    rigid_motion,
+)
 from ps_calibration.ring_target import RingTarget
 from ps_calibration.robust import soft
 from ps_calibration.shadow_model import light_and_rates
@@ -32,14 +41,10 @@ from ps_head_driver.head_model import DIRECTIONS, CameraGeometry, HeadModel
 from ps_head_driver.kinematics import PanelPose, PanelRing
 from ps_head_driver.stack import Mode, Panel, Stack
 
-# what is known of a panel beforehand: three times the tolerances of manufacture; its LEDs may be
-# others than those of the bright field
-_PRIOR = np.array([0.009, 0.009, 0.009, 0.105, 0.105, 0.5])
-_STEPS = np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3])      # typical sizes of the parameters
+# what is known of a panel beforehand: as of the bright field, but its LEDs may be others
+_PRIOR = np.array([*PANEL_PRIOR[:5], 0.5])
 _MODEL = 1e-3            # relative error expected of the model of the light
 _THIN = 4                # one block in so many gets the fit close
-_SOFT = 3.0              # standard deviations from which on a residual counts less
-_POINT_STEP = 1e-5       # m
 _DEAD = 0.3              # of the median of the four panels
 _LIKE = 0.5              # correlation of a panel's light with that as designed
 _BURNT = 0.2             # part of the plate that may be saturated
@@ -136,7 +141,10 @@ class DarkField:
         if not self.panels:
             return []
         ring = PanelRing(self.corrected(head).dark_field)
-        return [ring.pose(name, self.tilt) for name in DIRECTIONS]  # type: ignore[arg-type]
+        return ring.poses(self.tilt)
+
+
+NOT_REACHED = DarkField('NONE', 'the bright field comes first')
 
 
 def has_dark_field(stack: Stack) -> bool:
@@ -164,15 +172,13 @@ def calibrate_dark_field(stacks: Sequence[Stack], captures: Sequence[Sequence[ND
     tilt = next(stated_tilt(light) for light in stack.lights
                 if light.mode == Mode.DARK_FIELD and light.is_equation)
     ring = PanelRing(corrected(head, fit.panels).bright_field)
-    bright = [ring.pose(name, fit.tilts[position]) for name in DIRECTIONS]  # type: ignore
+    bright = ring.poses(fit.tilts[position])
     mean = float(np.mean([panel.intensity for panel in bright]))
     bright = [replace(panel, intensity=panel.intensity / mean) for panel in bright]
     light = measure_plate_light(pictures, burnt, np.sum(captures[position][:4], axis=0), bright,
                                 fit.pose, target, camera)
-    dark = PanelRing(head.dark_field)
-    nominal = [dark.pose(name, tilt) for name in DIRECTIONS]  # type: ignore[arg-type]
     designed = np.stack([light_of(fit.pose.panel_to_target(panel), light.points, target)
-                         for panel in nominal])
+                         for panel in PanelRing(head.dark_field).poses(tilt)])
     gains = np.nansum(light.values, axis=1) / np.nansum(
         np.where(np.isfinite(light.values), designed, math.nan), axis=1)
     for i, reason in enumerate(reasons):
@@ -191,11 +197,11 @@ def calibrate_dark_field(stacks: Sequence[Stack], captures: Sequence[Sequence[ND
 
 def _pictures(stack: Stack) -> tuple[list[NDArray], list[NDArray], list[str]]:
     """E, N, W, S without the light of the room, where they are saturated, and what is wrong."""
-    pictures, burnt, reasons = [], [], []
+    pictures, burnt, reasons, room = [], [], [], room_light(stack)
     for panel in (Panel.E, Panel.N, Panel.W, Panel.S):
         reason = ''
         try:
-            picture, white = without_room(stack, panel, Mode.DARK_FIELD)
+            picture, white = without_room(stack, panel, Mode.DARK_FIELD, room)
             if white.mean() > _BURNT:
                 reason = 'its picture is saturated; lower its exposure'
         except PsError:
@@ -250,8 +256,7 @@ class _Problem:
         rows = np.zeros((4, PER_PANEL))
         rows[self.i] = x
         ring = PanelRing(corrected(self.head, rows, 'dark_field').dark_field)
-        return self.pose.panel_to_target(
-            ring.pose(DIRECTIONS[self.i], self.tilt))  # type: ignore[arg-type]
+        return self.pose.panel_to_target(ring.pose(DIRECTIONS[self.i], self.tilt))
 
     def left(self, x: NDArray) -> NDArray:
         """Measured minus predicted, relative to the noise."""
@@ -259,17 +264,17 @@ class _Problem:
         return np.asarray((self.values - light) / self.noise)
 
     def residuals(self, x: NDArray) -> NDArray:
-        return np.concatenate([_SOFT * soft(-self.left(x) / _SOFT)[0],
+        return np.concatenate([SOFT * soft(-self.left(x) / SOFT)[0],
                                (x - self.start) / _PRIOR])
 
     def jacobian(self, x: NDArray) -> NDArray:
         panel = self.panel(x)
         light, by_motion = light_and_rates(self.points, panel, self.target.height,
                                            self.target.footprint)
-        slope = soft((light * panel.intensity - self.values) / self.noise / _SOFT)[1] / self.noise
+        slope = soft((light * panel.intensity - self.values) / self.noise / SOFT)[1] / self.noise
         columns = []
         for k in range(PER_PANEL - 1):
-            step = 0.1 * _STEPS[k]
+            step = 0.1 * PANEL_STEPS[k]
             moved = self.panel(x + step * np.eye(PER_PANEL)[k])
             columns.append(by_motion @ rigid_motion(panel, moved) / step)
         rates = panel.intensity * slope * np.stack([*columns, light])
@@ -277,11 +282,11 @@ class _Problem:
 
     def solve(self, x: NDArray) -> OptimizeResult:
         return least_squares(self.residuals, x, self.jacobian, method='lm', max_nfev=30,
-                             x_scale=10 * _STEPS, xtol=1e-8, ftol=1e-6)
+                             x_scale=10 * PANEL_STEPS, xtol=1e-8, ftol=1e-6)
 
 
 def fit_panel(i: int, light: PlateLight, tilt: float, usual: float, pose: TargetPose,
-               head: HeadModel, target: RingTarget, camera: CameraGeometry) -> DarkPanel:
+              head: HeadModel, target: RingTarget, camera: CameraGeometry) -> DarkPanel:
     """Fit one panel.
 
     :param i: which, 0 to 3 for E, N, W, S.
@@ -298,7 +303,7 @@ def fit_panel(i: int, light: PlateLight, tilt: float, usual: float, pose: Target
     known = np.isfinite(light.values[i])
     panel = problem.panel(fit.x)
     problem.values = problem.values - (
-        light.mean_light(panel, target)[known] - light_of(panel, problem.points, target))
+        mean_light(panel, light.corners, target)[known] - light_of(panel, problem.points, target))
     fit = problem.solve(fit.x)
     x, panel = fit.x, problem.panel(fit.x)
     left = problem.left(x)
@@ -318,8 +323,8 @@ def fit_panel(i: int, light: PlateLight, tilt: float, usual: float, pose: Target
                          else f'its shadows do not fit (residual {found.rms:.3f})',
                          residuals=residuals, shaded=shaded)
     if found.rms > _POOR_RMS:
-        return DarkPanel('POOR', f'its light fits badly (residual {found.rms:.3f}); clean the '
-                         'target and keep other light away', *list(vars(found).values())[2:])
+        return replace(found, verdict='POOR', reason=f'its light fits badly (residual '
+                       f'{found.rms:.3f}); clean the target and keep other light away')
     return found
 
 
@@ -327,7 +332,7 @@ def _edge(problem: _Problem, panel: PanelPose, left: NDArray) -> float:
     """What is left, as a shift of the shadow edges, m."""
     here = light_of(panel, problem.points, problem.target)
     slopes = [(light_of(panel, problem.points + shift, problem.target) - here)
-              / _POINT_STEP for shift in _POINT_STEP * np.eye(2)]
+              / POINT_STEP for shift in POINT_STEP * np.eye(2)]
     steep = np.hypot(*slopes) / problem.noise
     edges = steep > 0.3 * steep.max()
     return float(np.sqrt(np.sum(left[edges]**2) / np.sum(steep[edges]**2)))

@@ -46,14 +46,15 @@ class PlateLight:
     values: NDArray
     noise: NDArray
 
-    def mean_light(self, panel: PanelPose, target: RingTarget) -> NDArray:
-        """What a panel, given in the target frame, gives the blocks on average, (N,)."""
-        return np.mean([light_of(panel, corner, target) for corner in self.corners], axis=0)
-
 
 def light_of(panel: PanelPose, points: NDArray, target: RingTarget) -> NDArray:
     """Light of a panel, its intensity included, at (N, 2) points of the target's plate, (N,)."""
     return panel.intensity * plate_irradiance(points, panel, target.height, target.footprint)
+
+
+def mean_light(panel: PanelPose, corners: NDArray, target: RingTarget) -> NDArray:
+    """What it gives the blocks of PlateLight on average, (N,)."""
+    return np.asarray(np.mean([light_of(panel, corner, target) for corner in corners], axis=0))
 
 
 def free_light(panel: PanelPose, points: NDArray) -> NDArray:
@@ -79,15 +80,13 @@ def measure_plate_light(pictures: Sequence[NDArray], burnt: Sequence[NDArray],
     corners = np.stack([
         _on_plate(pixels + blocks.side / math.sqrt(12) * np.array(sides), pose, camera)
         for sides in product((-1, 1), repeat=2)])
-    light = PlateLight(pixels, _on_plate(pixels, pose, camera), corners, np.empty((4, 0)),
-                       np.empty((4, 0)))
-    known = sum(light.mean_light(pose.panel_to_target(panel), target) for panel in panels)
+    known = sum(mean_light(pose.panel_to_target(panel), corners, target) for panel in panels)
     with np.errstate(divide='ignore', invalid='ignore'):
         ratios = blocks.means[:4] / blocks.means[4]
     values = ratios[:, used] * known
     noise = np.stack([_noise(ratio, used) for ratio in ratios]) * known
     values[blocks.means[5:][:, used] > 0] = math.nan
-    return PlateLight(pixels, light.points, corners, values, noise)
+    return PlateLight(pixels, _on_plate(pixels, pose, camera), corners, values, noise)
 
 
 def _on_plate(pixels: NDArray, pose: TargetPose, camera: CameraGeometry) -> NDArray:

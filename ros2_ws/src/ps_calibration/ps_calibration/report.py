@@ -209,7 +209,7 @@ def _part(part: Comparison) -> dict[str, Any]:
             ('After', after, 'least squares with the lights as calibrated'),
             ('After, STV', part.after['stv'], 'robust against gloss'))]
     views.append(figure('Cross-section', figures.cross_section(part),
-                         'along the middle row of the picture'))
+                        'along the middle row of the picture'))
     return {'name': part.name, 'rows': rows, 'views': views}
 
 

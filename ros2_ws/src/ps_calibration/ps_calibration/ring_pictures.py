@@ -44,12 +44,16 @@ def nominal_tilt(stack: Stack, kinematics: BrightFieldKinematics) -> float:
                  if light.panel == Panel.E and light.mode == Mode.BRIGHT_FIELD)
     if light.motor_counts:
         return float(kinematics.tilt(light.motor_counts))
-    return math.acos(min(max(-light.axis[2], -1.0), 1.0))
+    return _axis_tilt(light)
 
 
 def stated_tilt(light: Light) -> float:
     """Tilt of a panel as its picture states it, or else from the light's own axis, rad."""
-    return light.tilt or math.acos(min(max(-light.axis[2], -1.0), 1.0))
+    return light.tilt or _axis_tilt(light)
+
+
+def _axis_tilt(light: Light) -> float:
+    return math.acos(min(max(-light.axis[2], -1.0), 1.0))
 
 
 def _range_of(images: Sequence[NDArray]) -> float:
@@ -104,17 +108,25 @@ def unrounded(picture: NDArray) -> NDArray:
     return out
 
 
-def without_room(stack: Stack, panel: Panel, mode: Mode = Mode.BRIGHT_FIELD,
+def room_light(stack: Stack) -> NDArray:
+    """The frame without panels at unit exposure, float32.
+
+    :raises PsError: CALIBRATION_BAD_REQUEST if there is none.
+    """
+    dark, scale = _frame(stack, Panel.NONE, Mode.BRIGHT_FIELD)
+    return unrounded(dark) / scale
+
+
+def without_room(stack: Stack, panel: Panel, mode: Mode, room: NDArray,
                  ) -> tuple[NDArray, NDArray]:
     """One frame at unit exposure without the light of the room, and where it is saturated.
 
+    :param room: as from room_light: it shines for as long as the shutter is open.
     :returns: (H, W) float32, and (H, W) bool.
     :raises PsError: CALIBRATION_BAD_REQUEST if there is no such frame.
     """
     image, scale = _frame(stack, panel, mode)
-    dark, dark_scale = _frame(stack, Panel.NONE, Mode.BRIGHT_FIELD)
-    # the room shines for as long as the shutter is open
-    grey = image.astype(np.float32) / scale - unrounded(dark) / dark_scale
+    grey = image.astype(np.float32) / scale - room
     burnt: NDArray = np.asarray(image >= _range_of(stack.images))
     if grey.ndim == 3:
         return grey.mean(axis=-1), np.asarray(burnt.any(axis=-1))
@@ -127,10 +139,10 @@ def light_only(stack: Stack) -> list[NDArray]:
     :raises PsError: CALIBRATION_CAPTURE_FAILED for pictures that cannot be used.
     """
     code, name = ErrorCode.CALIBRATION_CAPTURE_FAILED, stack.stack_id or 'pictures'
-    full = _range_of(stack.images)
+    full, room = _range_of(stack.images), room_light(stack)
     frames = []
     for panel in (Panel.E, Panel.N, Panel.W, Panel.S, Panel.ALL):
-        picture, burnt = without_room(stack, panel)
+        picture, burnt = without_room(stack, panel, Mode.BRIGHT_FIELD, room)
         if burnt.mean() > _SATURATED:
             raise PsError(code, f'{name}: frame {panel.name} is saturated; lower its exposure')
         frames.append(picture)

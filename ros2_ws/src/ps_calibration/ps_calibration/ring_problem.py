@@ -23,16 +23,16 @@ Field = Literal['bright_field', 'dark_field']
 # parameters of one panel: shift (radial, tangential, z), tilt_offset, twist, log of intensity
 PER_PANEL = 6
 # what is known of them beforehand: three times the tolerances of manufacture
-_PRIOR = np.array([0.009, 0.009, 0.009, 0.105, 0.105, 0.15])
+PANEL_PRIOR = np.array([0.009, 0.009, 0.009, 0.105, 0.105, 0.15])
 _TILT_PRIOR = 0.03                       # rad, error of the motor between two positions
 # typical sizes of the parameters
-_STEPS = np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3])
+PANEL_STEPS = np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3])
 _POSE_STEPS = np.array([1e-5, 1e-5, 1e-5, 1e-3, 5e-4, 5e-4])
 _HEIGHT_STEP, _TILT_STEP, _SOFTNESS_STEP = 2e-5, 1e-3, 0.1
 _SOFTNESS_PRIOR = 1.0    # a lens that blurs as much as the blocks do
-_POINT_STEP = 1e-5                       # m
+POINT_STEP = 1e-5                        # m
 _DOT_NOISE_PX = 0.003
-_SOFT = 3.0              # standard deviations from which on a residual counts less
+SOFT = 3.0               # standard deviations from which on a residual counts less
 
 
 def corrected(head: HeadModel, panels: NDArray, field: Field = 'bright_field') -> HeadModel:
@@ -66,10 +66,10 @@ class RingProblem:
         self.expected = np.zeros(self.size)
         self.expected[self.softness] = 1.0
         self.prior = np.full(self.size, np.inf)
-        self.prior[:4 * PER_PANEL] = np.tile(_PRIOR, 4)
+        self.prior[:4 * PER_PANEL] = np.tile(PANEL_PRIOR, 4)
         self.prior[self.first_tilt:self.softness] = _TILT_PRIOR
         self.prior[self.softness] = _SOFTNESS_PRIOR
-        self.scale = np.concatenate([np.tile(_STEPS, 4), _POSE_STEPS,
+        self.scale = np.concatenate([np.tile(PANEL_STEPS, 4), _POSE_STEPS,
                                      np.full(len(shares) - 1, _TILT_STEP), [_SOFTNESS_STEP],
                                      np.full(int(free_height), _HEIGHT_STEP)])
         #: what averaging over a block adds to the shares, per position (4, N) once it is known
@@ -109,8 +109,7 @@ class RingProblem:
         pose = self.pose(x)
         panels = x[:4 * PER_PANEL].reshape(4, PER_PANEL)
         ring = PanelRing(corrected(self.head, panels).bright_field)
-        return [pose.panel_to_target(ring.pose(name, self.tilt(x, position)))  # type: ignore
-                for name in DIRECTIONS]
+        return [pose.panel_to_target(panel) for panel in ring.poses(self.tilt(x, position))]
 
     def lights(self, x: NDArray) -> list[NDArray]:
         """Irradiance per position, (4, N)."""
@@ -161,8 +160,8 @@ class RingProblem:
         gains = [panel.intensity for panel in panels]
         light = np.stack([gain * part[0] for gain, part in zip(gains, lit, strict=True)])
         by_motion = [gain * part[1] for gain, part in zip(gains, lit, strict=True)]
-        by_point = [(self._light(points + shift, panels, height) - light) / _POINT_STEP
-                    for shift in _POINT_STEP * np.eye(2)]
+        by_point = [(self._light(points + shift, panels, height) - light) / POINT_STEP
+                    for shift in POINT_STEP * np.eye(2)]
         rates = np.zeros((self.size, *light.shape))
         for k in range(self.size):
             moved, step = x.copy(), self.scale[k] * 0.1
@@ -192,10 +191,10 @@ class RingProblem:
 
     def residuals(self, x: NDArray) -> NDArray:
         """Normalised by the noise expected; specks in the pictures count less."""
-        parts = [soft(-difference / (share.noise * _SOFT))[0]
+        parts = [soft(-difference / (share.noise * SOFT))[0]
                  for difference, share in zip(self.differences(x), self.shares, strict=True)]
         dots = dot_errors(self.pose(x).numbers, self.dots_px, self.target, self.camera)
-        return np.concatenate([*(_SOFT * part.ravel() for part in parts), dots / _DOT_NOISE_PX,
+        return np.concatenate([*(SOFT * part.ravel() for part in parts), dots / _DOT_NOISE_PX,
                                (x - self.expected) / self.prior])
 
     def jacobian(self, x: NDArray) -> NDArray:
@@ -203,7 +202,7 @@ class RingProblem:
         parts = []
         for k, (difference, share) in enumerate(
                 zip(self.differences(x), self.shares, strict=True)):
-            slope = soft(difference / (share.noise * _SOFT))[1]
+            slope = soft(difference / (share.noise * SOFT))[1]
             parts.append((self.share_rates(x, k) * (slope / share.noise)).reshape(self.size, -1))
         dots = np.zeros((self.size, self.dots_px.size))
         numbers = self.pose(x).numbers

@@ -11,7 +11,7 @@ from ps_calibration.ring_target import RingTarget
 from ps_head_driver.camera_model import plane_points
 from ps_head_driver.fake.renderer import OFF, Sensor, make_renderer
 from ps_head_driver.fake.ring_renderer import Placement, RingRenderer, RingSolid, placement
-from ps_head_driver.head_model import DIRECTIONS, HeadModel
+from ps_head_driver.head_model import HeadModel
 from ps_head_driver.kinematics import (
     BrightFieldKinematics,
     DarkFieldKinematics,
@@ -141,7 +141,7 @@ def errors_of(calibrated: HeadModel, plane: Plane, bench: Bench, tilt: float) ->
     vectors, intensities = [], []
     for head in (calibrated, bench.head):
         ring = BrightFieldKinematics(head).ring
-        poses = [ring.pose(name, tilt) for name in DIRECTIONS]  # type: ignore[arg-type]
+        poses = ring.poses(tilt)
         vectors.append(np.stack([light_vectors(as_light(pose), point) for pose in poses]))
         gains = np.array([pose.intensity for pose in poses])
         intensities.append(gains / gains.mean())
@@ -170,7 +170,7 @@ def dark_errors(calibrated: HeadModel, bench: Bench) -> DarkErrors:
     for head in (calibrated, bench.head):
         ring = DarkFieldKinematics(head).ring
         usual = np.mean([panel.intensity for panel in head.bright_field.panels.values()])
-        poses = [ring.pose(name, DF_TILT) for name in DIRECTIONS]  # type: ignore[arg-type]
-        vectors.append(np.stack([light_vectors(as_light(pose), point) / usual for pose in poses]))
+        vectors.append(np.stack([light_vectors(as_light(pose), point) / usual
+                                 for pose in ring.poses(DF_TILT)]))
     lengths = np.linalg.norm(vectors, axis=-1)
     return DarkErrors(angular_error_deg(*vectors), lengths[0] / lengths[1] - 1)

@@ -11,7 +11,7 @@ from ps_calibration.ring_fit import RingFit
 from ps_calibration.ring_problem import PER_PANEL, Field, corrected
 from ps_calibration.target_pose import TargetPose
 from ps_head_driver.camera_model import plane_points
-from ps_head_driver.head_model import DIRECTIONS, CameraGeometry, HeadModel
+from ps_head_driver.head_model import CameraGeometry, HeadModel
 from ps_head_driver.kinematics import PanelRing, as_light
 from ps_head_driver.light_model import light_vectors
 
@@ -107,8 +107,7 @@ def light_directions(head: HeadModel, pose: TargetPose, camera: CameraGeometry,
     """Unit vectors towards the light of E, N, W, S at the middle of the plane, (4, 3)."""
     point = plane_points(camera, [camera.cx, camera.cy], pose.plane)
     ring = PanelRing(getattr(head, field))
-    vectors = np.stack([light_vectors(as_light(ring.pose(name, tilt)), point)  # type: ignore
-                        for name in DIRECTIONS])
+    vectors = np.stack([light_vectors(as_light(panel), point) for panel in ring.poses(tilt)])
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 

@@ -10,8 +10,8 @@ import yaml
 
 from ps_head_driver.errors import ErrorCode, PsError
 
-DIRECTIONS: tuple[str, ...] = ('E', 'N', 'W', 'S')
 Direction = Literal['E', 'N', 'W', 'S']
+DIRECTIONS: tuple[Direction, ...] = ('E', 'N', 'W', 'S')
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -87,7 +87,7 @@ class PanelTolerance(_Section):
 
 def _nominal_ring() -> dict[Direction, PanelTolerance]:
     quarter_turn = 1.5707963267948966
-    return {name: PanelTolerance(azimuth=i * quarter_turn) for i, name in enumerate(DIRECTIONS)}  # type: ignore[misc]
+    return {name: PanelTolerance(azimuth=i * quarter_turn) for i, name in enumerate(DIRECTIONS)}
 
 
 class BrightField(_Section):

@@ -42,7 +42,7 @@ class PanelRing:
     """
 
     def __init__(self, field: BrightField | DarkField) -> None:
-        own = [field.panels[name] for name in DIRECTIONS]  # type: ignore[index]
+        own = [field.panels[name] for name in DIRECTIONS]
         self.size, self.lobe_exponent = field.panel_size, field.lobe_exponent
         self.intensities = [panel.intensity for panel in own]
         self._tilt_offset = np.array([panel.tilt_offset for panel in own])
@@ -75,6 +75,10 @@ class PanelRing:
         return PanelPose(center=center[index], axis=axis[index], right=self.right[index],
                          size=self.size, lobe_exponent=self.lobe_exponent,
                          intensity=self.intensities[index])
+
+    def poses(self, tilt: float) -> list[PanelPose]:
+        """Poses of all panels, E N W S, at a nominal tilt, rad."""
+        return [self.pose(direction, tilt) for direction in DIRECTIONS]
 
 
 @nb.njit(cache=True)
@@ -285,8 +289,7 @@ def lights_at(head: HeadModel, m_counts: int, dark_field_tilt: float) -> list[Li
     for mode, prefix, ring, angle in (
             (Mode.BRIGHT_FIELD, 'BF', bright.ring, float(bright.tilt(m_counts))),
             (Mode.DARK_FIELD, 'DF', dark.ring, dark_field_tilt)):
-        for name in DIRECTIONS:
-            pose = ring.pose(name, angle)  # type: ignore[arg-type]
+        for name, pose in zip(DIRECTIONS, ring.poses(angle), strict=True):
             lights.append(as_light(pose, name=f'{prefix}_{name}', mode=mode, panel=Panel[name],
                                    motor_counts=int(m_counts), tilt=angle))
     return lights

@@ -54,7 +54,7 @@ def spread_of(values: NDArray, quantile: float = 0.5) -> float:
 
 
 def samples(problem: Problem, row: NDArray, column: NDArray, every: bool = False
-             ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
+            ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
     """What the solver sees at P pixels, without black ones unless ``every``.
 
     :returns: u (T, P), d (T, 3, P), h (T, 3, P), usable (T, P) 0 or 1, g_ls (3, P), float32.

@@ -37,12 +37,12 @@ def draw(head: HeadModel, path: Path) -> None:
     tilt = min(_SHOWN_TILT, bright.tilt_limits[1])
     for name in ('E', 'W'):
         for angle, alpha in ((bright.tilt_limits[0], 0.25), (tilt, 1.0)):
-            pose = bright.panel_pose(name, angle)      # type: ignore[arg-type]
+            pose = bright.panel_pose(name, angle)
             hinge = bright.ring.hinges[DIRECTIONS.index(name)]
             arm = np.stack([hinge, pose.center])[:, [0, 2]] * _MM
             ax.plot(*arm.T, color=_INK, lw=1.2, alpha=alpha)
             _panel(ax, pose, _BRIGHT, alpha)
-        low = dark.panel_pose(name, dark.tilt_limits[1])      # type: ignore[arg-type]
+        low = dark.panel_pose(name, dark.tilt_limits[1])
         _panel(ax, low, _DARK, 1.0)
     reach = 1.2 * (head.bright_field.hinge.r + head.bright_field.arm.along)
     ax.plot([-reach * _MM, reach * _MM], [0, 0], color=_INK, lw=1)

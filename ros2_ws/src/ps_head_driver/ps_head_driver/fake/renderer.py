@@ -197,7 +197,7 @@ class Renderer(ABC):
                                           (self._dark.panel_pose, df_tilt, df_levels)):
             for direction, level in zip(DIRECTIONS, levels, strict=True):
                 if level > 0:
-                    pose = panel_pose(direction, angle)  # type: ignore[arg-type]
+                    pose = panel_pose(direction, angle)
                     total += np.float32(level) * self.panel_radiance(pose)
         return total
 

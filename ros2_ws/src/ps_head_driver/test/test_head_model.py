@@ -81,7 +81,8 @@ def test_panel_missing_is_named(tmp_path):
         load_head(write(tmp_path, data))
 
 
-slopes = st.floats(-20, 20)
+# a subnormal slope rounds to a normal without a sign: 5e-324 / 2.2 is 0
+slopes = st.floats(-20, 20, allow_subnormal=False)
 
 
 @given(slopes, slopes)

@@ -2,7 +2,6 @@
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-import threading
 import time
 from typing import Any
 
@@ -11,7 +10,6 @@ import pytest
 
 pytest.importorskip('ps_interfaces.msg', reason='needs the built workspace (make setup)')
 
-from rclpy.action import ActionClient
 from std_srvs.srv import Trigger
 import yaml
 
@@ -77,34 +75,11 @@ def calibrate(client: CellClient, at: int | None = None,
     :param at: stage at which ``meanwhile`` is called with the goal.
     :returns: result and all feedback.
     """
-    actions = ActionClient(client.node, CalibrateRing, 'calibrate_ring')
-    feedback: list = []
-    reached, done = threading.Event(), threading.Event()
-
-    def on_feedback(message: Any) -> None:
-        feedback.append(message.feedback)
-        if message.feedback.state == at:
-            reached.set()
-
-    try:
-        assert actions.wait_for_server(20.0)
-        sending, accepted = actions.send_goal_async(
-            CalibrateRing.Goal(**goal), feedback_callback=on_feedback), threading.Event()
-        sending.add_done_callback(lambda _: accepted.set())
-        assert accepted.wait(20)
-        handle = sending.result()
-        getting = handle.get_result_async()
-        getting.add_done_callback(lambda _: done.set())
-        if at is not None:
-            for _ in range(600):
-                if reached.wait(0.1) or done.is_set():
-                    break
-            assert reached.is_set(), getting.result().result.message
-            meanwhile(handle)
-        assert done.wait(300)
-        return getting.result().result, feedback
-    finally:
-        actions.destroy()
+    sent = client.send(CalibrateRing, 'calibrate_ring', CalibrateRing.Goal(**goal))
+    if at is not None:
+        assert sent.wait_for(lambda feedback: feedback.state == at, 60), sent.result(300).message
+        meanwhile(sent)
+    return sent.result(300), sent.feedback
 
 
 def test_the_ring_scene_is_the_shipped_target() -> None:
@@ -209,7 +184,7 @@ def test_cancel(client: CellClient, stage: int) -> None:
 
     def cancel(goal: Any) -> None:
         begin.append(time.monotonic())
-        goal.cancel_goal_async()
+        goal.cancel()
 
     result, feedback = calibrate(client, stage, cancel, apply=True)
     if stage == STATE.FITTING:      # all positions of the parameter have been visited

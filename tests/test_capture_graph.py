@@ -13,7 +13,6 @@ pytest.importorskip('ps_interfaces.msg', reason='needs the built workspace (make
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Parameter as RosParameter
 from rcl_interfaces.srv import GetParameters, SetParameters
-from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
 
 from ps_head_driver import ros_support
@@ -117,32 +116,13 @@ def test_explicit_steps_with_ambient_over_the_action(client: CellClient):
 
 
 def acquire(client: CellClient, cancel_after: float | None = None,
-            on_feedback: Callable = lambda _: None, **goal):
-    feedback: list = []
-
-    def keep(message):
-        feedback.append(message.feedback)
-        on_feedback(message.feedback)
-
-    actions = ActionClient(client.node, action.AcquireStack, 'acquire_stack')
-    try:
-        assert actions.wait_for_server(10.0)
-        accepted = wait_for(actions.send_goal_async(
-            action.AcquireStack.Goal(**goal), keep))
-        assert accepted.accepted
-        if cancel_after is not None:
-            time.sleep(cancel_after)
-            wait_for(accepted.cancel_goal_async())
-        return wait_for(accepted.get_result_async()).result, feedback
-    finally:
-        actions.destroy()
-
-
-def wait_for(future, timeout: float = 60.0):
-    done = threading.Event()
-    future.add_done_callback(lambda _: done.set())
-    assert done.wait(timeout), 'no answer'
-    return future.result()
+            on_feedback: Callable = lambda _: None, **fields):
+    goal = client.send(action.AcquireStack, 'acquire_stack', action.AcquireStack.Goal(**fields),
+                       on_feedback)
+    if cancel_after is not None:
+        time.sleep(cancel_after)
+        goal.cancel()
+    return goal.result(), goal.feedback
 
 
 @pytest.mark.parametrize(('kind', 'name', 'fields', 'code'), [

@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 _MOST_STEPS = 100
 # radius over the spread of the points beyond which they are a line
 _STRAIGHT = 1e3
+# beyond this it may be the wrong one of several minima, and these centres are tried as well
+_FLAT = 5.0
+_STARTS = ((0.0, 0.0), (0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7))
 
 
 def fit_circles(points: NDArray) -> tuple[NDArray, NDArray, NDArray]:
@@ -52,7 +55,19 @@ def fit_circle(points, x, y):  # type: ignore[no-untyped-def]
     for i in range(count):      # so that any size of circle is well conditioned
         x[i] /= size
         y[i] /= size
-    a, b = _algebraic(x, y)
+    start_a, start_b = _algebraic(x, y)
+    a, b, radius, cost = _descend(x, y, start_a, start_b)
+    if radius > _FLAT:       # a small circle may fit the points better than this huge one
+        for start in _STARTS:
+            other = _descend(x, y, start[0], start[1])
+            if other[3] < cost:
+                a, b, radius, cost = other
+    return x0 + size * a, y0 + size * b, size * radius, size * math.sqrt(cost / count)
+
+
+@nb.njit(cache=True)
+def _descend(x, y, a, b):  # type: ignore[no-untyped-def]
+    """Centre, radius and sum of squared distances of the minimum downhill of a centre."""
     cost, radius = _cost(x, y, a, b)
     damping = 0.0
     last = math.inf
@@ -70,7 +85,7 @@ def fit_circle(points, x, y):  # type: ignore[no-untyped-def]
             damping = 0.1 * damping if damping > 1e-6 else 0.0
         else:
             damping = max(10 * damping, 1e-3)
-    return x0 + size * a, y0 + size * b, size * radius, size * math.sqrt(cost / count)
+    return a, b, radius, cost
 
 
 @nb.njit(cache=True)

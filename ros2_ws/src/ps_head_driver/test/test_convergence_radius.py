@@ -2,7 +2,7 @@
 import os
 
 from heads import NOMINAL, random_head
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
@@ -36,6 +36,7 @@ def test_nominal_axes_cross_near_41_7_degrees():
 
 @settings(max_examples=60, deadline=None)
 @given(seeds, st.floats(0, 0.75), st.floats(0.12, 0.2))
+@example(1500, 0.478515625, 0.14714399498850836)      # a small circle beats a huge one
 def test_forward_agrees_with_rays_and_an_independent_circle_fit(seed, where, light_height):
     head = random_head(np.random.default_rng(seed))
     solver = CrSolver(head, light_height)
@@ -73,7 +74,8 @@ def test_forward_agrees_with_rays_and_an_independent_circle_fit(seed, where, lig
         # points almost in line: the best circle is a huge one, which the reference may not find
         assert solution.residual <= size * np.sqrt(np.mean(best.fun**2)) + 1e-9
         return
-    tolerance = 1e-9 + 1e-8 * size      # the reference optimiser's own precision
+    # the reference optimiser's own precision, worse for large circles through close points
+    tolerance = 1e-9 + 1e-8 * size + 1e-5 * solution.convergence_radius
     assert solution.convergence_radius == pytest.approx(2 * size * best.x[2], abs=tolerance)
     assert solution.residual == pytest.approx(size * np.sqrt(np.mean(best.fun**2)), abs=1e-9)
     np.testing.assert_allclose(solution.center, size * best.x[:2], atol=tolerance)

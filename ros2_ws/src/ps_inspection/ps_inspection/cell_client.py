@@ -10,6 +10,7 @@ import time
 from types import TracebackType
 from typing import Any
 
+from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -17,6 +18,7 @@ from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
 from ps_head_driver import ros_support
+from ps_head_driver.action_client import ActionClient
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_inspection.running_goal import RunningGoal
 from ps_interfaces import msg as ps
@@ -41,6 +43,11 @@ class CellClient:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         self._changed = threading.Condition()
+        # Made once and kept: a client that is destroyed just when the other thread begins to wait
+        # for answers ends that thread (rclpy 7.1), and a new one must be discovered first.
+        self._asking = threading.Lock()
+        self._services: dict[str, Client] = {}
+        self._actions: dict[str, ActionClient] = {}
         self.status: ps.HeadStatus | None = None
         self.stacks: dict[str, tuple[ps.PhotometricStack, float]] = {}
         self.done: dict[str, tuple[ps.AcquisitionDone, float]] = {}
@@ -126,12 +133,11 @@ class CellClient:
         :raises PsError: the code and message of an answer without success, or that nobody
             answered.
         """
-        client = self.node.create_client(kind, name)
-        try:
-            response = ros_support.call(client, request or kind.Request(), timeout,
-                                        ErrorCode.SEQUENCER_HEAD_UNAVAILABLE)
-        finally:
-            self.node.destroy_client(client)
+        with self._asking:
+            if name not in self._services:
+                self._services[name] = self.node.create_client(kind, name)
+        response = ros_support.call(self._services[name], request or kind.Request(), timeout,
+                                    ErrorCode.SEQUENCER_HEAD_UNAVAILABLE)
         if not response.success:
             raise _error_of(response)
         return response
@@ -139,7 +145,10 @@ class CellClient:
     def send(self, kind: Any, name: str, goal: Any,
              on_feedback: Callable[[Any], None] = lambda _: None) -> RunningGoal:
         """Send a goal to an action of the cell; see RunningGoal for what to do with it."""
-        return RunningGoal(self.node, kind, name, goal, on_feedback)
+        with self._asking:
+            if name not in self._actions:
+                self._actions[name] = ActionClient(self.node, kind, name)
+        return RunningGoal(self._actions[name], name, goal, on_feedback)
 
     def home(self) -> None:
         """Home the motor and wait until the head is ready."""

@@ -3,8 +3,6 @@ from collections.abc import Callable
 import threading
 from typing import Any
 
-from rclpy.node import Node
-
 from ps_head_driver.action_client import ActionClient
 from ps_head_driver.errors import ErrorCode, PsError
 
@@ -16,18 +14,18 @@ class RunningGoal:
     :raises PsError: INSPECTION_INTERNAL if nobody serves the action.
     """
 
-    def __init__(self, node: Node, kind: Any, name: str, goal: Any,
+    def __init__(self, client: ActionClient, name: str, goal: Any,
                  on_feedback: Callable[[Any], None] = lambda _: None,
                  timeout: float = 10.0) -> None:
         self.feedback: list[Any] = []
         self._name, self._on_feedback = name, on_feedback
         self._changed = threading.Condition()
-        self._client = ActionClient(node, kind, name)
-        if not self._client.wait_for_server(timeout):
-            self._client.destroy()
+        if not client.wait_for_server(timeout):
             raise PsError(ErrorCode.INSPECTION_INTERNAL,
                           f'action {name} is not there; is its node running?')
-        self._handle = self._done(self._client.send_goal_async(goal, self._keep), timeout)
+        self._handle = self._done(client.send_goal_async(goal, self._keep), timeout)
+        if not self._handle.accepted:
+            raise PsError(ErrorCode.INSPECTION_INTERNAL, f'action {name} rejected the goal')
         self._result = self._handle.get_result_async()
 
     def _keep(self, message: Any) -> None:
@@ -58,6 +56,4 @@ class RunningGoal:
 
         :raises PsError: INSPECTION_INTERNAL if it does not come in time.
         """
-        answer = self._done(self._result, timeout)
-        self._client.destroy()
-        return answer.result
+        return self._done(self._result, timeout).result

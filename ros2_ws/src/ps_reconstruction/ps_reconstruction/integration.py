@@ -20,7 +20,7 @@ from ps_reconstruction import backend
 from ps_reconstruction.bands import core_count, for_bands
 from ps_reconstruction.problem import expand
 
-BAND = 32
+BAND = 128                    # few calls: each has to wait for the GIL
 FAST = {'contract', 'reassoc', 'arcp', 'nsz', 'afn'}
 
 

@@ -29,13 +29,15 @@ def cell_environment(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
     """Return the variables every process of the cell runs with, name to value.
 
     * FASTRTPS_DEFAULT_PROFILES_FILE (the name Fast DDS 2.x reads): shared memory for stacks.
-    * MALLOC_MMAP_MAX_, MALLOC_TRIM_THRESHOLD_ (glibc): keep freed image buffers, because mapping
-      and zeroing fresh pages for every stack costs more than copying it.
+    * MALLOC_MMAP_MAX_, MALLOC_TRIM_THRESHOLD_, MALLOC_ARENA_MAX (glibc): keep freed image buffers,
+      for all threads, because mapping and zeroing fresh pages for every stack costs more than
+      copying it.
     """
     defaults = {
         'FASTRTPS_DEFAULT_PROFILES_FILE': str(fastdds_profile()),
         'MALLOC_MMAP_MAX_': '0',
         'MALLOC_TRIM_THRESHOLD_': '4000000000',
+        'MALLOC_ARENA_MAX': '1',
     }
     return {name: environ.get(name) or value for name, value in defaults.items()}
 

@@ -110,7 +110,7 @@ class StackPipeline:
         """The ReconstructionInfo of an acquired stack.
 
         :param timeout: s.
-        :param alive: whether the reconstruction is there at all.
+        :param alive: whether the reconstruction that got the stack is still there.
         :raises PsError: INSPECTION_CANCELLED, _RECONSTRUCTION_LOST or _STACK_DROPPED.
         """
         deadline = time.monotonic() + timeout
@@ -130,7 +130,8 @@ class StackPipeline:
                     raise PsError(
                         ErrorCode.INSPECTION_RECONSTRUCTION_LOST,
                         f'no result of the reconstruction for stack {stack_id} '
-                        + (f'within {timeout:g} s' if late else 'because its node has gone'))
+                        + (f'within {timeout:g} s' if late else 'because its node has gone or '
+                           'was started again'))
                 self._change.wait(_POLL_S)
             return self._results.pop(stack_id)
 

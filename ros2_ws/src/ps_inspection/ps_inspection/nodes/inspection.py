@@ -25,6 +25,7 @@ from ps_inspection.illumination_search import IlluminationSearch
 from ps_inspection.inspection_request import check_request
 from ps_inspection.nodes.illumination_prober import IlluminationProber, Request, ring_steps
 from ps_inspection.nodes.output_images import OutputImages
+from ps_inspection.reconstruction_watch import ReconstructionWatch
 from ps_inspection.stack_pipeline import StackPipeline
 from ps_interfaces import msg as ps
 from ps_interfaces.action import AcquireStack, Inspect, SearchIllumination
@@ -50,6 +51,7 @@ PARAMETERS = [
               read_only=True),
 ]
 _FRESH_S = 5.0        # for the reconstruction to be discovered after a start
+_LOOK_S = 0.25        # between two looks for new and lost reconstructions
 
 
 class InspectionNode(Node):
@@ -75,9 +77,12 @@ class InspectionNode(Node):
         events = MutuallyExclusiveCallbackGroup()     # in the order they came
         self.create_subscription(ps.AcquisitionDone, 'acquisition_done', self._on_acquired,
                                  ros_support.RELIABLE, callback_group=events)
-        self._info_topic = self.create_subscription(
+        info_topic = self.create_subscription(
             ps.ReconstructionInfo, 'reconstruction_info', self.pipeline.reconstructed,
             ros_support.LATCHED, callback_group=events).topic_name
+        self._watch = ReconstructionWatch(lambda: [
+            tuple(each.endpoint_gid) for each in self.get_publishers_info_by_topic(info_topic)])
+        self.create_timer(_LOOK_S, self._watch.look)
         self.create_subscription(String, 'session/active', self._on_session, ros_support.LATCHED,
                                  callback_group=events)
         self.create_subscription(String, 'session/recorded', self._on_recorded,
@@ -161,10 +166,11 @@ class InspectionNode(Node):
                 with (self.pipeline.place(lambda: goal.is_cancel_requested) as taken,
                       self._camera_of(goal)):
                     self._capture(goal, result, capture_over)
+                    alive = self._watch.follow()
                     taken(result.stack_id)
                 capture_over()
                 _tell(goal, stage.RECONSTRUCTING, True)
-                self._reconstruct(goal, result)
+                self._reconstruct(goal, result, alive)
                 self._deliver(goal, result)
 
         self._finish(goal, result, work)
@@ -222,7 +228,8 @@ class InspectionNode(Node):
         """Illumination and capture; fills stack_id."""
         request, stage, state = goal.request, Inspect.Feedback, AcquireStack.Feedback
         deadline = time.monotonic() + _FRESH_S
-        while not self._reconstruction_is_there():
+        while not self._watch.ready():
+            self._source.check(lambda: goal.is_cancel_requested)
             if time.monotonic() > deadline:
                 raise PsError(ErrorCode.INSPECTION_RECONSTRUCTION_LOST,
                               'nobody publishes reconstruction_info; is the reconstruction node '
@@ -256,10 +263,11 @@ class InspectionNode(Node):
             take, self.parameters['capture_timeout'], lambda: goal.is_cancel_requested,
             on_feedback).stack_id
 
-    def _reconstruct(self, goal: ServerGoalHandle, result: Inspect.Result) -> None:
+    def _reconstruct(self, goal: ServerGoalHandle, result: Inspect.Result,
+                     alive: Callable[[], bool]) -> None:
         result.info = self.pipeline.wait(
             result.stack_id, self.parameters['reconstruction_timeout'],
-            lambda: goal.is_cancel_requested, self._reconstruction_is_there)
+            lambda: goal.is_cancel_requested, alive)
         if not result.info.success:
             code = result.info.error_code
             name = ErrorCode(code).name if code in ErrorCode._value2member_map_ else str(code)
@@ -296,9 +304,6 @@ class InspectionNode(Node):
             time.sleep(0.02)
         folder = _folder(self.parameters['session_folder'], 'PS_SESSION_FOLDER', '~/ps_sessions')
         result.uris = [(folder / session).as_uri(), *result.uris]
-
-    def _reconstruction_is_there(self) -> bool:
-        return self.count_publishers(self._info_topic) > 0
 
     # ------------------------------------------------------------------ afterwards
 

@@ -32,12 +32,14 @@ def cell_environment(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
     * MALLOC_MMAP_MAX_, MALLOC_TRIM_THRESHOLD_, MALLOC_ARENA_MAX (glibc): keep freed image buffers,
       for all threads, because mapping and zeroing fresh pages for every stack costs more than
       copying it.
+    * OMP_WAIT_POLICY: threads of one process that wait for work leave the cores to the others.
     """
     defaults = {
         'FASTRTPS_DEFAULT_PROFILES_FILE': str(fastdds_profile()),
         'MALLOC_MMAP_MAX_': '0',
         'MALLOC_TRIM_THRESHOLD_': '4000000000',
         'MALLOC_ARENA_MAX': '1',
+        'OMP_WAIT_POLICY': 'PASSIVE',
     }
     return {name: environ.get(name) or value for name, value in defaults.items()}
 

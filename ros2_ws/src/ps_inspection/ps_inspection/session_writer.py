@@ -183,7 +183,11 @@ class SessionWriter:
         bag.write(message.topic, message.data, message.log_time, message.publish_time)
         if message.on_written is not None:
             bag.flush(self._options.sync)
-            message.on_written()
+            try:
+                message.on_written()
+            except Exception as error:      # no fault of the disk
+                raise PsError(ErrorCode.SESSION_INTERNAL, 'acknowledging a message: '
+                              f'{type(error).__name__}: {error}') from error
 
     def _check_space(self, size: int) -> None:
         left = self._bag.free_bytes() - size

@@ -151,8 +151,9 @@ def test_missing_metadata_is_made_again(tmp_path: Path) -> None:
 
 
 CHILD = """
-import os, sys, time
+import os, signal, sys, time
 from pathlib import Path
+signal.signal(signal.SIGPIPE, signal.SIG_DFL)       # an orphan ends
 sys.path[:0] = {path!r}
 from test_session_files import BIG, SMALL, string_cdr
 from ps_inspection.session_writer import SessionWriter, WriterOptions
@@ -205,6 +206,20 @@ def wait_for(condition: object, seconds: float = 5.0) -> None:
     while not condition() and time.monotonic() < end:     # type: ignore[operator]
         time.sleep(0.01)
     assert condition()                                    # type: ignore[operator]
+
+
+def test_fault_of_the_caller_is_not_blamed_on_the_disk(tmp_path: Path) -> None:
+    def acknowledge() -> None:
+        raise BrokenPipeError('gone')
+
+    writer = SessionWriter(tmp_path / 's', [BIG], WriterOptions(sync=False, min_free_bytes=0))
+    writer.write(BIG.name, string_cdr(b'x'), 1, 1, acknowledge)
+    writer.close()
+    assert writer.error is not None
+    assert writer.error.code == ErrorCode.SESSION_INTERNAL
+    assert 'BrokenPipeError: gone' in writer.error.message
+    recover(Session(tmp_path / 's'))
+    assert len(list(Session(tmp_path / 's').messages())) == 1
 
 
 def test_nearly_full_disk_ends_with_a_complete_session(tmp_path: Path, monkeypatch) -> None:

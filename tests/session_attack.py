@@ -14,6 +14,7 @@ import tempfile
 from typing import Any
 
 from matplotlib import colormaps  # noqa: F401   makes its configuration folder when imported
+import numba
 import numpy as np
 from session_mutator import Mutator
 
@@ -54,6 +55,8 @@ def use(folder: Path, out: Path, seed: int) -> None:
 
 
 _watched: list[tuple[Path, list[str]]] = []
+# the compiler's cache is no change outside: a kernel is compiled for every type of its inputs
+_CACHE = [Path(os.path.realpath(folder)) for folder in (numba.config.CACHE_DIR,) if folder]
 # audit event: places of paths among its arguments, and of the file descriptors of their folders
 _CHANGES = {'os.mkdir': {0: 2}, 'os.rename': {0: 2, 1: 3}, 'os.remove': {0: 1}, 'os.rmdir': {0: 1},
             'os.symlink': {1: 2}, 'os.link': {1: 3}, 'os.truncate': {0: None}}
@@ -80,7 +83,8 @@ def _audit(event: str, arguments: tuple[Any, ...]) -> None:
     inside, found = _watched[-1]
     for path in paths:
         real = Path(os.path.realpath(path) if event == 'open' else path)
-        if not real.is_relative_to(inside) and '__pycache__' not in real.parts:
+        if not any(map(real.is_relative_to, (inside, *_CACHE))) and (
+                '__pycache__' not in real.parts):
             found.append(f'{event} {real}')
 
 

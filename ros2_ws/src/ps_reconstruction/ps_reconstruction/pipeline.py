@@ -12,6 +12,7 @@ from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.stack import Geometry, Stack
 from ps_reconstruction import integration, least_squares, preview, surface
 from ps_reconstruction.near_field import (
+    COARSE_PIXELS,
     check,
     photometric_problem,
     stack_rays,
@@ -192,14 +193,18 @@ def warm_up(method: str = 'ls') -> None:
     """Compile the kernels of a method on a small stack, so that the first real one is not late."""
     from ps_head_driver.head_model import CameraGeometry
     from ps_head_driver.stack import Light, Panel
-    camera = CameraGeometry(width_px=48, height_px=40, fx=300, fy=300, cx=23.5, cy=19.5,
-                            camera_standoff=0.3)
+    # as large as it must be to be treated like a real one: in bands, and reduced for the rounds
+    # of height and light
+    shape = (COARSE_PIXELS + 1, 40)
+    camera = CameraGeometry(width_px=shape[1], height_px=shape[0], fx=2000, fy=2000,
+                            cx=shape[1] / 2, cy=shape[0] / 2, camera_standoff=0.3)
     lights = [Light(panel=Panel(i), position=(0.1 * c, 0.1 * s, 0.12), size=(0.06, 0.03),
                     axis=(-0.64 * c, -0.64 * s, -0.768375), right=(-s, c, 0.0))
               for i, (c, s) in enumerate([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])]
     for dtype in (np.uint8, np.uint16):
-        images = [np.full((40, 48), 100, dtype) for _ in lights]
-        reconstruct(Stack(images, lights, camera), Options(method=method))
+        images = [np.full(shape, 100, dtype) for _ in lights]
+        for trust in ('least_squares', 'reflectance') if method == 'stv' else ('auto',):
+            reconstruct(Stack(images, lights, camera), Options(method=method, trust=trust))
 
 
 @contextmanager

@@ -1,6 +1,8 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -281,3 +283,40 @@ def test_least_squares_gives_the_published_diligent_values(
     assert truth is not None
     error = angular_error_deg(reconstruct(stack, outputs={'normal'}).normal, truth.normal)
     assert error[stack.mask].mean() == pytest.approx(published, abs=0.03)
+
+
+COMPILED = """
+from dataclasses import replace
+import sys
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+from ps_head_driver.fake.renderer import make_renderer
+from ps_head_driver.head_model import load_head, nominal_head_path
+from ps_head_driver.kinematics import BrightFieldKinematics, lights_at
+from ps_head_driver.stack import Stack
+from ps_reconstruction.pipeline import METHODS, Options, reconstruct, warm_up
+
+def kernels():
+    return {(name, key, str(signature)) for name, module in list(sys.modules.items())
+            if name.startswith('ps_reconstruction') for key, value in vars(module).items()
+            if isinstance(value, Dispatcher) for signature in value.signatures}
+
+head = load_head(nominal_head_path())
+renderer = make_renderer('boss', head, scale=0.3)
+tilt = float(BrightFieldKinematics(head).tilt(20_000))
+stack = Stack([renderer.render(tilt, 1.3, np.eye(4)[i], frame=i) for i in range(4)],
+              lights_at(head, 20_000, 1.3)[:4], renderer.camera)
+for method in METHODS:
+    warm_up(method)
+    before = kernels()
+    for images in (stack.images, [image.astype(np.uint16) * 257 for image in stack.images]):
+        reconstruct(replace(stack, images=images), Options(method=method))
+    print(method, kernels() - before or 'nothing')
+"""
+
+
+def test_nothing_is_left_to_compile_for_the_first_stack() -> None:
+    """In a process of its own: others have compiled what they need."""
+    done = subprocess.run([sys.executable, '-c', COMPILED], capture_output=True, text=True,
+                          timeout=300, check=True)
+    assert done.stdout.splitlines() == [f'{method} nothing' for method in METHODS]

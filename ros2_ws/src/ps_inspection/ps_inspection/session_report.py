@@ -134,7 +134,8 @@ def _content(summary: Summary, parts: list[dict[str, Any]], session: Session) ->
         'tiles': [
             _counted(len({entry.name for entry in entries}), 'part'),
             _counted(len(entries), 'stack'), _counted(faults, 'fault'),
-            ('valid pixels, median', _median([r['valid_fraction'] for r in results], '{:.1%}')),
+            ('valid pixels, median', _median(
+                [r['valid_fraction'] * 100 for r in results], '{:.1f} %')),
             ('last exposure to result, median', _median(waits, '{:.2f} s'))],
         'faults': faults, 'parts': parts, 'left_out': len(entries) - len(parts),
         'roughness': _columns(parts, [('Sa', itemgetter('sa_um')), ('Sq', itemgetter('sq_um'))]),
@@ -221,8 +222,10 @@ def _median(values: Sequence[float], form: str) -> str:
 
 
 def _clock(seconds: float) -> str:
-    """As in 1:02:03.4; minutes and seconds where there are no hours."""
+    """As in 3.4 s, 2:03.4 min or 1:02:03 h."""
     tenths = round(seconds * 10)
-    hours, minutes = tenths // 36000, tenths // 600 % 60
-    rest = f'{minutes:02d}:{tenths % 600 / 10:04.1f}'
-    return f'{hours}:{rest}' if hours else rest
+    if tenths < 600:
+        return f'{tenths / 10:.1f} s'
+    if tenths < 36000:
+        return f'{tenths // 600}:{tenths % 600 / 10:04.1f} min'
+    return f'{tenths // 36000}:{tenths // 600 % 60:02d}:{tenths % 600 // 10:02d} h'

@@ -165,7 +165,8 @@ class _Summarizer:
         if calibration.calibration_id:
             created = datetime.fromtimestamp(calibration.created.sec, UTC)
             self._summary.calibrations[calibration.calibration_id] = {
-                'created': f'{created:%Y-%m-%d %H:%M} UTC', 'head serial': calibration.head_serial,
+                'created': f'{created:%Y-%m-%d %H:%M} UTC' if calibration.created.sec else '',
+                'head serial': calibration.head_serial,
                 'target': calibration.target_name,
                 'verdict': ('none', 'OK', 'POOR', 'FAILED')[min(calibration.verdict, 3)],
                 'reason': calibration.verdict_reason}

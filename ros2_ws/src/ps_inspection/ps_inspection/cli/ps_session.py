@@ -7,6 +7,7 @@ import json
 import os
 from pathlib import Path
 import select
+import signal
 import sys
 from typing import Any
 
@@ -165,10 +166,12 @@ def _play(options: argparse.Namespace, console: Console) -> Report:
         return paused
 
     session = Session(options.session)
-    # Ctrl-C must end the sleep between two messages, not only the context
+    # Ctrl-C must end the sleep between two messages, not only the context; and so must SIGTERM:
+    # who dies in the graph leaves a dead listener in shared memory that disturbs those who live
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node('ps_session_player')
     try:
-        node = rclpy.create_node('ps_session_player')
         player = Player(
             node, session,
             PlayOptions(options.rate, options.start, options.loop, options.all,
@@ -177,8 +180,8 @@ def _play(options: argparse.Namespace, console: Console) -> Report:
             lambda message: console.print(f'{message.log_time * 1e-9:.3f} {message.topic.name}'),
         )
         sent = player.play()
-        node.destroy_node()
     finally:
+        node.destroy_node()
         rclpy.try_shutdown()
     _damage(player.problems, console)
     console.print(f'{sent} messages played')

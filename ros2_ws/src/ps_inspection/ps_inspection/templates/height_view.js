@@ -48,6 +48,11 @@ class HeightView {
     this.request();
   }
 
+  /* how much taller than it is, as text */
+  factor() {
+    return `${+this.exaggeration.toPrecision(2)}`;
+  }
+
   colourBy(what) {
     this.colouring = what;
     this.request();
@@ -230,7 +235,7 @@ class HeightView {
     context.textAlign = 'left';
     context.fillText(HeightView.length(bar, metric), 16, height - 24);
     if (this.exaggeration > 1) {
-      context.fillText(`heights × ${+this.exaggeration.toPrecision(3)}`, 16, 24);
+      context.fillText(`heights × ${this.factor()}`, 16, 24);
     }
     if (this.colouring === 'height') {
       const lowest = HeightView.length(this.map.low, metric);
@@ -306,13 +311,19 @@ class HeightView {
   const {maps, colours} = JSON.parse(document.getElementById('reliefs').textContent);
   const view = new HeightView(canvas, colours);
   const part = document.getElementById('part'), tall = document.getElementById('tall');
+  const times = document.getElementById('times');
+  const told = () => { times.value = view.factor(); };
   const choose = (number) => {
     part.value = number;
     view.show(maps[number]);
     tall.value = Math.log10(view.exaggeration);
+    told();
   };
   part.addEventListener('change', () => choose(Number(part.value)));
-  tall.addEventListener('input', () => view.exaggerate(10 ** Number(tall.value)));
+  tall.addEventListener('input', () => {
+    view.exaggerate(10 ** Number(tall.value));
+    told();
+  });
   document.getElementById('colouring').addEventListener(
     'change', (event) => view.colourBy(event.target.value));
   document.querySelectorAll('button[data-relief]').forEach((button) => {

@@ -66,7 +66,7 @@ def test_page_has_all_and_loads_nothing(page: Path) -> None:
     text = page.read_text(encoding='utf-8')
     for expected in (*PARTS, 'cal-7', 'PS-0042', 'ps_inspection 0.1.0', 'smoothness',
                      'panel BF_N draws no current', '100.0 250.0 300.0 in base',
-                     'Trial &lt;1&gt; &amp;'):
+                     'Trial &lt;1&gt; &amp;', '; 5.6 s. Trial'):
         assert expected in text, expected
     assert 'Trial <1>' not in text
     links = Links()
@@ -159,6 +159,13 @@ def test_page_works_in_a_browser(browser: Browser, page: Path, width: int) -> No
     browser.drawn()
     assert browser.script("document.getElementById('part').value") == '2'
     assert browser.script(CANVAS)[1] != before
+
+    browser.script("""(() => {
+        const tall = document.getElementById('tall');
+        tall.value = 2;
+        tall.dispatchEvent(new Event('input'));
+    })()""")
+    assert browser.script("document.getElementById('times').value") == '100'
 
     browser.script("document.querySelectorAll('button.picture')[1].click()")
     assert browser.script("document.getElementById('enlarged').open")

@@ -10,6 +10,7 @@ import pytest
 
 pytest.importorskip('ps_interfaces.msg', reason='needs the built workspace (make setup)')
 
+from rcl_interfaces.srv import GetParameters
 from std_srvs.srv import Trigger
 import yaml
 
@@ -17,6 +18,7 @@ from ps_calibration.graph import NODES as CALIBRATION_NODES
 from ps_calibration.ring_fit import corrected
 from ps_calibration.ring_target import default_target_path, load_target
 from ps_calibration.synthetic import Bench, dark_errors, errors_of, panels_off, solid_of
+from ps_head_driver import ros_support
 from ps_head_driver.calibration_file import HeadCalibration as HeadCalibrationFile
 from ps_head_driver.calibration_file import apply, read_calibration, write_calibration
 from ps_head_driver.errors import ErrorCode, PsError
@@ -25,7 +27,7 @@ from ps_head_driver.graph import NODES as HEAD_NODES
 from ps_head_driver.head_client import PANEL_NAMES
 from ps_head_driver.head_model import load_head, nominal_head_path
 from ps_head_driver.stack import Plane
-from ps_head_driver.stack_folder import read_stack
+from ps_head_driver.stack_folder import read_lights, read_stack
 from ps_inspection.cell_client import CellClient
 from ps_inspection.runner import Cell
 from ps_interfaces import srv
@@ -39,9 +41,9 @@ STATE = CalibrateRing.Feedback
 
 
 def true_head():
-    """Panels of both fields off by up to 3 mm, 2 degrees and 5 %."""
+    """Panels of both fields off by up to 3 mm, 2 degrees and 5 %, and more play in the motor."""
     random = np.random.default_rng(12)
-    head = corrected(NOMINAL, panels_off(random))
+    head = corrected(NOMINAL, panels_off(random)).model_copy(update={'backlash_counts': 300})
     return corrected(head, panels_off(random), 'dark_field')
 
 
@@ -140,6 +142,24 @@ def test_calibration_brings_the_lights_closer_to_the_truth(
     listed = client.call(Trigger, 'ring_calibration/list').message
     assert f'{identifier}.yaml  OK' in listed
     assert listed.endswith('(active)')
+
+
+def test_the_play_of_the_motor_is_found(client: CellClient, folder: Path) -> None:
+    result, feedback = calibrate(client, convergence_radii=[0.04, 0.07, 0.1],
+                                 working_directory='both_sides')
+    assert result.success, result.message
+    assert feedback[-1].total == 6      # each radius from below and from above
+    sides = [read_lights(folder / 'files' / 'both_sides' / f'position_{k + 1}').approach
+             for k in range(6)]
+    assert sides == ['up'] * 3 + ['down'] * 3
+    found = result.calibration.backlash_counts
+    assert found == pytest.approx(true_head().backlash_counts, abs=30)
+    assert f'backlash {found}' in result.message
+    # the driver ends its moves as before
+    asked = client.node.create_client(GetParameters, 'head_driver/get_parameters')
+    value, = ros_support.call(asked, GetParameters.Request(names=['approach']), 10.0,
+                              ErrorCode.HEAD_INTERNAL).values
+    assert value.string_value == 'up'
 
 
 def test_files_are_loaded_saved_and_refused(client: CellClient, folder: Path) -> None:

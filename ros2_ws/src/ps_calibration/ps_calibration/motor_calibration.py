@@ -77,6 +77,18 @@ class MotorCalibration:
         return round(counts - play)
 
 
+def visits(radii: Sequence[float]) -> list[tuple[float, Approach | None]]:
+    """Where to take pictures, and from which side to arrive.
+
+    :param radii: convergence radii, m.
+    :returns: each once, from the side that is set; with enough of them for the motor's own
+        calibration each from below, and again from above on the way back.
+    """
+    if len(set(radii)) < _POSITIONS:
+        return [(radius, None) for radius in radii]
+    return [*((radius, 'up') for radius in radii), *((radius, 'down') for radius in radii[::-1])]
+
+
 def calibrate_motor(readings: Sequence[TiltReading], head: HeadModel) -> MotorCalibration:
     """Fit the motor's parameters.
 
@@ -124,12 +136,12 @@ def calibrate_motor(readings: Sequence[TiltReading], head: HeadModel) -> MotorCa
 
 
 def motor_of(result: Calibration, stacks: Sequence[Stack], head: HeadModel,
-             approaches: Sequence[Approach] = ()) -> MotorCalibration | None:
+             approaches: Sequence[Approach | None] = ()) -> MotorCalibration | None:
     """The motor's own calibration from a ring calibration at several positions.
 
     :param stacks: that the result is from.
     :param head: as designed.
-    :param approaches: last direction of motion of each; up if not given.
+    :param approaches: last direction of motion of each; up if not known.
     :returns: None with fewer than three positions, without counts or after a failure.
     """
     if result.fit is None or result.verdict == 'FAILED':
@@ -138,8 +150,8 @@ def motor_of(result: Calibration, stacks: Sequence[Stack], head: HeadModel,
               for stack in stacks]
     if len(set(counts)) < _POSITIONS:
         return None
-    sides: Sequence[Approach] = approaches or ['up'] * len(counts)
-    return calibrate_motor([TiltReading(*reading) for reading in zip(
+    sides = approaches or [None] * len(counts)
+    return calibrate_motor([TiltReading(at, tilt, side or 'up') for at, tilt, side in zip(
         counts, result.fit.tilts, sides, strict=True)], head)
 
 

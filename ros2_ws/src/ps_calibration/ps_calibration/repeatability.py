@@ -31,11 +31,15 @@ class Repeatability:
     z_scale: float
 
 
-def repeats(stacks: Sequence[Stack]) -> list[list[Stack]]:
-    """Groups of two and more stacks taken at the same motor counts."""
-    groups: dict[int, list[Stack]] = {}
-    for stack in stacks:
-        groups.setdefault(stack.lights[0].motor_counts, []).append(stack)
+def repeats(stacks: Sequence[Stack],
+            approaches: Sequence[str | None] = ()) -> list[list[Stack]]:
+    """Groups of two and more stacks taken at the same motor counts.
+
+    :param approaches: from which side the motor arrived at each; the same for all if not given.
+    """
+    groups: dict[tuple[int, str | None], list[Stack]] = {}
+    for stack, side in zip(stacks, approaches or [None] * len(stacks), strict=True):
+        groups.setdefault((stack.lights[0].motor_counts, side), []).append(stack)
     return [group for group in groups.values() if len(group) > 1]
 
 

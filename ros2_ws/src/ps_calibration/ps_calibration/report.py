@@ -18,7 +18,7 @@ from ps_calibration import report_figures as figures
 from ps_calibration.before_after import Comparison
 from ps_calibration.calibrate import Calibration, head_calibration
 from ps_calibration.dark_field_report import dark_field_section
-from ps_calibration.motor_calibration import MotorCalibration
+from ps_calibration.motor_calibration import Approach, MotorCalibration, motor_of
 from ps_calibration.repeatability import Repeatability, repeatability, repeats
 from ps_calibration.report_parts import figure, single_pictures
 from ps_calibration.ring_height import height_map, wall_height
@@ -72,21 +72,25 @@ class Evidence:
 
 
 def gather(result: Calibration, stacks: Sequence[Stack], names: Sequence[str], target: RingTarget,
-           head: HeadModel, serial: str = '', motor: MotorCalibration | None = None) -> Evidence:
-    """Make the calibration's file and measure the repeatability, if pictures were repeated.
+           head: HeadModel, serial: str = '',
+           approaches: Sequence[Approach | None] = ()) -> Evidence:
+    """Make the calibration's file; calibrate the motor and measure the repeatability, too, where
+    there are pictures for it.
 
     :param head: as designed.
+    :param approaches: last direction of the motor before each stack; up if not known.
     :returns: without a calibration after a failure.
     """
     if result.fit is None or result.verdict == 'FAILED':
         return Evidence(result, stacks, names, target, head, datetime.now(UTC), serial=serial)
     calibration = head_calibration(result, head, target, serial)
+    motor = motor_of(result, stacks, head, approaches)
     if motor is not None:
         known = motor.backlash_counts > 0
         calibration = calibration.model_copy(update={
             'motor': motor.correction,
             'backlash_counts': round(motor.backlash_counts) if known else 0})
-    repeated = [found for group in repeats(stacks)
+    repeated = [found for group in repeats(stacks, approaches)
                 if (found := repeatability(group, target, head)) is not None]
     return Evidence(result, stacks, names, target, head, calibration.created, calibration, motor,
                     repeated, serial=serial)

@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from ps_calibration.motor_calibration import TiltReading, calibrate_motor
+from ps_calibration.motor_calibration import TiltReading, calibrate_motor, visits
 from ps_head_driver.convergence_radius import CrSolver
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.fake.motor import Motor
@@ -76,6 +76,12 @@ def test_one_sided_readings_leave_the_backlash_open(nominal: HeadModel) -> None:
                              for m in (10000, 20000, 30000)], nominal)
     assert math.isnan(found.backlash_counts)
     assert found.scale == pytest.approx(1, abs=1e-6)
+
+
+def test_enough_radii_are_visited_from_both_sides() -> None:
+    assert visits([0.04, 0.06, 0.06]) == [(0.04, None), (0.06, None), (0.06, None)]
+    assert visits([0.04, 0.06, 0.09]) == [
+        (0.04, 'up'), (0.06, 'up'), (0.09, 'up'), (0.09, 'down'), (0.06, 'down'), (0.04, 'down')]
 
 
 def test_too_few_positions_are_refused(nominal: HeadModel) -> None:

@@ -5,6 +5,7 @@ cut off or made by something
 else is refused with the reason. It is written to a temporary name and renamed, so a crash never
 leaves half a file.
 """
+from collections.abc import Iterable
 from datetime import UTC, datetime
 import hashlib
 import json
@@ -27,6 +28,7 @@ from ps_head_driver.head_model import (
     parse_yaml,
     read_yaml,
 )
+from ps_head_driver.stack import Light, Mode
 
 FORMAT = 'ps_head_calibration'
 VERSION = 2
@@ -121,6 +123,11 @@ class HeadCalibration(_Section):
         if abs(length - 1) > 1e-3 or self.plane_normal[2] <= 0:
             raise ValueError('plane_normal must be a unit vector with a positive z')
         return self
+
+    def covers(self, lights: Iterable[Light]) -> bool:
+        """Whether every panel that is one of these lights alone has been calibrated."""
+        return all(f'{"DF" if light.mode is Mode.DARK_FIELD else "BF"}_{light.panel.name}'
+                   in self.panels for light in lights if light.is_equation)
 
 
 def apply(head: HeadModel, calibration: HeadCalibration | None) -> HeadModel:

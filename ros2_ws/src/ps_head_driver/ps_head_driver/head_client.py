@@ -167,8 +167,7 @@ class HeadClient:
         low, high = self.limits
         beyond = motion.overshoot_counts
         self._ask(self._motor, Command.LIMITS, protocol.LIMITS_REQUEST.pack(
-            low - beyond if motion.approach_up else low,
-            high if motion.approach_up else high + beyond))
+            low - beyond, high + beyond))     # the side of arrival can change later
         self._ask(self._lights, Command.GAINS, protocol.GAINS_REQUEST.pack(*self._gains))
         if self.state().faults is Fault.WATCHDOG:
             self.clear_fault()

@@ -20,10 +20,12 @@ from ps_head_driver.stack_pictures import check_alike, write_image
 _BAD = ErrorCode.RECONSTRUCTION_BAD_STACK
 
 
-def write_stack(stack: Stack, path: str | Path, truth: Truth | None = None) -> None:
+def write_stack(stack: Stack, path: str | Path, truth: Truth | None = None,
+                approach: str | None = None) -> None:
     """Write a stack folder: all of it, or nothing.
 
     :param path: must not exist, or be an empty folder.
+    :param approach: last direction of the motor, up or down, where it is known.
     :raises PsError: RECONSTRUCTION_BAD_STACK if it is not empty or cannot be written, or if the
         stack could not be read again.
     """
@@ -35,7 +37,7 @@ def write_stack(stack: Stack, path: str | Path, truth: Truth | None = None) -> N
         folder.parent.mkdir(parents=True, exist_ok=True)
         part = Path(tempfile.mkdtemp(prefix=f'.{folder.name}.', dir=folder.parent))
         try:
-            _write_files(stack, part, truth)
+            _write_files(stack, part, truth, approach)
             part.chmod(0o755)
             os.replace(part, folder)
         except BaseException:
@@ -60,7 +62,8 @@ def _check(stack: Stack, folder: Path) -> None:
                             f'{stack.shape}')
 
 
-def _write_files(stack: Stack, folder: Path, truth: Truth | None) -> None:
+def _write_files(stack: Stack, folder: Path, truth: Truth | None,
+                 approach: str | None) -> None:
     names = [f'{i:03d}' for i in range(len(stack.images))]
     files = [write_image(folder / name, image)
              for name, image in zip(names, stack.images, strict=True)]
@@ -75,6 +78,8 @@ def _write_files(stack: Stack, folder: Path, truth: Truth | None) -> None:
     if stack.mask is not None:
         write_image(folder / 'mask', stack.mask.astype(np.uint8) * 255)
     content = {**_whole(stack), 'frames': frames}
+    if approach:
+        content['approach'] = approach
     # what is written can be read: a wrong light is found now, not when it is needed
     parse_yaml(LightsFile, content, str(folder / 'lights.yaml'), _BAD)
     (folder / 'lights.yaml').write_text(

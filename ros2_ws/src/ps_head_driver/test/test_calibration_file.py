@@ -18,6 +18,7 @@ from ps_head_driver.calibration_file import (
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import load_head, nominal_head_path
 from ps_head_driver.kinematics import BrightFieldKinematics
+from ps_head_driver.stack import Light, Mode, Panel
 
 
 @pytest.fixture
@@ -53,6 +54,13 @@ def test_corrections_reach_the_head(calibration):
     # counts mean what the corrected slider makes of them
     found, nominal = (BrightFieldKinematics(each) for each in (fixed, head))
     assert found.tilt(20000) == pytest.approx(nominal.tilt(20000 * 1.002 + 150 * 1.002))
+
+
+def test_a_stack_is_calibrated_if_all_its_panels_are(calibration):
+    east, south = Light(Panel.E), Light(Panel.S, Mode.DARK_FIELD)
+    assert calibration.covers([east, south, Light(Panel.ALL), Light(Panel.NONE)])
+    assert not calibration.covers([east, Light(Panel.S)])
+    assert not calibration.covers([Light(Panel.E, Mode.DARK_FIELD), south])
 
 
 def refused(path, code):

@@ -54,8 +54,9 @@ def test_home_and_move_end_on_the_same_side(homed: Bench) -> None:
 
 def test_the_other_side_leaves_the_backlash(homed: Bench) -> None:
     client, control = homed
-    client.move_to(20000, Motion(approach_up=False, settle_s=0.0))
-    assert control.command('state')['slider_counts'] == pytest.approx(20120, abs=4)
+    for target in (20000, 64000):       # the end of the range, too
+        client.move_to(target, Motion(approach_up=False, settle_s=0.0))
+        assert control.command('state')['slider_counts'] == pytest.approx(target + 120, abs=4)
 
 
 def test_move_before_homing_is_refused(bench: Bench) -> None:

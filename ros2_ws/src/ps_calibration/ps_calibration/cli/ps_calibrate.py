@@ -12,7 +12,6 @@ from ps_calibration.before_after import Outcome, compare
 from ps_calibration.calibrate import Calibration, calibrate
 from ps_calibration.catalogue import list_calibrations
 from ps_calibration.dark_field import PARAMETERS as DARK_PARAMETERS
-from ps_calibration.motor_calibration import motor_of
 from ps_calibration.report import Evidence, gather, report, write_report
 from ps_calibration.ring_target import RingTarget, default_target_path, load_target
 from ps_calibration.uncertainty import dark_figures
@@ -181,10 +180,9 @@ def main() -> None:
         head = load_head(arguments.head or nominal_head_path())
         target = load_target(arguments.target or default_target_path())
         stacks, result = calibrate_folders(arguments.folders, target, head)
-        motor = motor_of(result, stacks, head, [
-            read_lights(folder).approach or 'up' for folder in arguments.folders[:len(stacks)]])
         evidence = gather(result, stacks, [folder.name for folder in arguments.folders], target,
-                          head, arguments.serial, motor)
+                          head, arguments.serial, [
+            read_lights(folder).approach for folder in arguments.folders[:len(stacks)]])
         if evidence.calibration:
             evidence = replace(evidence, parts=[
                 compare(folder.name, *read_stack(folder), head, evidence.calibration)

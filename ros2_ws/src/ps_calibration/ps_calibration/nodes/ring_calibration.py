@@ -13,7 +13,8 @@ from std_srvs.srv import Trigger
 
 from ps_calibration.calibrate import calibrate
 from ps_calibration.catalogue import list_calibrations
-from ps_calibration.motor_calibration import motor_of
+from ps_calibration.motor_calibration import Approach, visits
+from ps_calibration.motor_side import MotorSide
 from ps_calibration.report import gather, report, write_report
 from ps_calibration.ring_pictures import common_camera
 from ps_calibration.ring_target import RingTarget, default_target_path, load_target
@@ -72,6 +73,7 @@ class RingCalibration(Node):
         self._running: ServerGoalHandle | None = None
         self._source = StackSource(self, ErrorCode.CALIBRATION_CAPTURE_FAILED,
                                    ErrorCode.CALIBRATION_CANCELLED)
+        self._motor_side = MotorSide(self)
         self._publisher = self.create_publisher(
             ps.HeadCalibration, 'calibration', ros_support.LATCHED)
         self.create_subscription(
@@ -212,19 +214,20 @@ class RingCalibration(Node):
                           f'convergence_radii: {radii} must be positive, at least one')
         keep = (self._path(request.working_directory, 'working_directory')
                 if request.working_directory else None)
-        stacks = self._take_stacks(goal, radii, target, keep)
-        done = len(radii)
-        self._feedback(goal, CalibrateRing.Feedback.FITTING, done, len(radii))
+        stops = visits(radii)
+        stacks = self._take_stacks(goal, stops, target, keep)
+        done = len(stops)
+        self._feedback(goal, CalibrateRing.Feedback.FITTING, done, done)
         fitted = self._in_worker(lambda: calibrate(stacks, target, self.head))
         result.verdict = getattr(ps.HeadCalibration, f'VERDICT_{fitted.verdict}')
         result.reason = fitted.full_reason
         if fitted.fit is not None:
             result.residuals_px = [float(edge) for edges in fitted.fit.edge_px for edge in edges]
-        self._feedback(goal, CalibrateRing.Feedback.REPORTING, done, len(radii))
+        self._feedback(goal, CalibrateRing.Feedback.REPORTING, done, done)
         serial = self.parameters['head_serial'] or self.reported_serial
         evidence = self._in_worker(lambda: gather(
             fitted, stacks, [f'position_{k + 1}' for k in range(done)], target, self.head, serial,
-            motor_of(fitted, stacks, self.head)))
+            [side for _, side in stops]))
         text = self._in_worker(lambda: report(evidence))
         # the name has the serial number in it, which came over the network
         path = self._path(f'{evidence.name}.yaml', 'serial number')
@@ -238,6 +241,9 @@ class RingCalibration(Node):
         result.message = f'{calibration.verdict}, written to {path}, report beside it'
         if fitted.dark.verdict != 'OK':
             result.message += f'; dark field {fitted.dark.verdict}: {fitted.dark.reason}'
+        if evidence.motor is not None:
+            result.message += (f'; motor: backlash {evidence.motor.backlash_counts:.0f}, repeats '
+                               f'to {evidence.motor.repeatability_counts:.0f} counts')
         if request.apply and calibration.verdict == 'OK':
             self._source.check(self._cancelled.is_set)
             self.active, self.refused = calibration, ''
@@ -246,27 +252,30 @@ class RingCalibration(Node):
         elif request.apply:
             result.message += '; not made active, load it with ring_calibration/load to do so'
 
-    def _take_stacks(self, goal: ServerGoalHandle, radii: Sequence[float], target: RingTarget,
-                     keep: Path | None) -> list[Stack]:
-        """One stack per convergence radius; the first also tells how well the target lies."""
+    def _take_stacks(self, goal: ServerGoalHandle, stops: Sequence[tuple[float, Approach | None]],
+                     target: RingTarget, keep: Path | None) -> list[Stack]:
+        """One stack per stop; the first also tells how well the target lies."""
         state = CalibrateRing.Feedback
         stacks: list[Stack] = []
         hint: SetupHint | None = None
-        with self._source.listening():
-            for number, radius in enumerate(radii):
+        with self._source.listening(), self._motor_side.restored():
+            for number, (radius, side) in enumerate(stops):
+                if side is not None:
+                    self._motor_side.choose(side)
+
                 def on_feedback(capture: Any, number: int = number,
                                 hint: SetupHint | None = hint) -> None:
                     moving = capture.state == AcquireStack.Feedback.MOVING
                     self._feedback(goal, state.MOVING if moving else state.CAPTURING, number,
-                                   len(radii), hint)
+                                   len(stops), hint)
                 stack = self._source.take(
                     AcquireStack.Goal(steps=self._steps(radius, number == 0),
                                       part_id='ring calibration'),
                     self.parameters['capture_timeout'], self._cancelled.is_set, on_feedback)
                 if keep is not None:
-                    _keep(stack, keep / f'position_{number + 1}')
+                    _keep(stack, keep / f'position_{number + 1}', side)
                 hint = setup_hint(stack, target, common_camera([stack], self.head))
-                self._feedback(goal, state.DETECTING, number + 1, len(radii), hint)
+                self._feedback(goal, state.DETECTING, number + 1, len(stops), hint)
                 stacks.append(stack)
         return stacks
 
@@ -331,10 +340,10 @@ class RingCalibration(Node):
             'target': self.active.target_name, 'head': self.active.head_serial}
 
 
-def _keep(stack: Stack, folder: Path) -> None:
+def _keep(stack: Stack, folder: Path, side: Approach | None) -> None:
     """:raises PsError: CALIBRATION_WRITE_FAILED."""
     try:
-        write_stack(stack, folder)
+        write_stack(stack, folder, approach=side)
     except PsError as error:
         raise PsError(ErrorCode.CALIBRATION_WRITE_FAILED,
                       f'working_directory: {error.message}') from error

@@ -307,7 +307,8 @@ class CameraSequencer(Node):
             self.camera.camera_geometry or self.head.camera)
         stack = replace(
             stack, camera=_fit(camera, stack.shape),
-            geometry=Geometry.CALIBRATED if calibration else Geometry.NOMINAL,
+            geometry=Geometry.CALIBRATED if calibration and calibration.covers(taken.lights)
+            else Geometry.NOMINAL,
             calibration_id=calibration.calibration_id if calibration else '',
             plane=Plane(calibration.plane_normal, calibration.plane_offset)
             if calibration else Plane())

@@ -47,8 +47,7 @@ PARAMETERS = [
               read_only=True),
     Parameter('home_on_activation', True, 'Home by itself whenever the board does not know its '
               'position'),
-    Parameter('approach', 'up', 'Last direction of every move', choices=('up', 'down'),
-              read_only=True),
+    Parameter('approach', 'up', 'Last direction of every move', choices=('up', 'down')),
     Parameter('overshoot', 400, 'Way beyond the target when coming from the wrong side; more than '
               'the backlash', 'counts', 0, 5000, read_only=True),
     Parameter('in_position', 4, 'Allowed error of a finished move', 'counts', 0, 1000),

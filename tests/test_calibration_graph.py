@@ -81,7 +81,7 @@ def calibrate(client: CellClient, at: int | None = None,
     if at is not None:
         assert sent.wait_for(lambda feedback: feedback.state == at, 60), sent.result(300).message
         meanwhile(sent)
-    return sent.result(300), sent.feedback
+    return sent.result(600), sent.feedback
 
 
 def test_the_ring_scene_is_the_shipped_target() -> None:

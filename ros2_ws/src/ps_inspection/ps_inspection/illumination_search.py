@@ -82,7 +82,9 @@ class IlluminationSearch:
             return min(unseen, key=self.least_error)
         predicted = [self.predicted_error(s) for s in open_settings]
         best = int(np.argmin(predicted))
-        if predicted[best] > (1 - WORTHWHILE) * min(self.errors):
+        # nor does a setting of a single ring see its own errors without another to compare with
+        compared = len(self.probes) > 1
+        if compared and predicted[best] > (1 - WORTHWHILE) * min(self.errors):
             return None
         return open_settings[best]
 

@@ -10,9 +10,11 @@ import pytest
 
 from ps_calibration.calibrate import calibrate
 from ps_calibration.cli import ps_calibrate
+from ps_calibration.ring_fit import corrected
 from ps_calibration.ring_pictures import common_camera, light_only, nominal_tilt, unrounded
 from ps_calibration.ring_target import RingTarget
 from ps_calibration.synthetic import Bench, errors_of, render_stack, solid_of
+from ps_calibration.synthetic_dirt import glints, shiny_wall, specks
 from ps_calibration.synthetic_faults import FAULTS, Fault, Rendered
 from ps_head_driver.calibration_file import apply, read_calibration
 from ps_head_driver.errors import ErrorCode, PsError
@@ -66,6 +68,20 @@ def test_pictures_without_noise_give_the_axes_although_their_pixels_are_averaged
         assert angular_error_deg(found.axis, true.axis) < 0.06
         assert np.linalg.norm(found.center - true.center) < 5e-5
     assert result.z_scale == pytest.approx(1, abs=3 * result.z_scale_deviation)
+
+
+def test_a_dirty_scratched_and_shiny_target_will_do(
+        stack: Stack, bench: Bench, nominal: HeadModel, target: RingTarget) -> None:
+    """More of it: tests/bench/bench_calibration_dirt.py."""
+    pictures = shiny_wall(glints(specks(stack, 50), 4), bench, target, 0.05)
+    result = calibrate([pictures], target, nominal)
+    assert result.verdict == 'OK', result.reason
+    assert result.fit is not None
+    errors = errors_of(corrected(nominal, result.fit.panels), result.fit.pose.plane, bench,
+                       result.fit.tilts[0])
+    assert errors.direction_deg.max() < 0.15
+    assert np.abs(errors.intensity).max() < 0.006
+    assert result.z_scale == pytest.approx(1, abs=0.005)
 
 
 # those that cost no fit; tests/bench/bench_calibration_verdicts.py has the rest

@@ -20,8 +20,9 @@ from ps_head_driver.head_model import HeadModel
 from ps_head_driver.kinematics import BrightFieldKinematics
 from ps_head_driver.stack import Panel, Stack
 
-# what is plausible: offset (counts), scale, phase of the crank (rad), backlash (counts)
-_PRIOR = np.array([2000.0, 0.02, 0.05, 2000.0])
+# what is plausible: offset (counts), scale, phase of the crank (rad), backlash (counts). The first
+# three look much alike over a short range; wide, they would run away beyond it
+_PRIOR = np.array([500.0, 0.005, 0.015, 2000.0])
 _POSITIONS = 3                  # different ones, at least
 Approach = Literal['up', 'down']
 _TILT_NOISE = 1e-4              # rad, of a tilt from a ring calibration

@@ -239,18 +239,18 @@ class RingCalibration(Node):
         write_calibration(calibration, path)
         result.calibration = calibration_to_message(calibration, self.head)
         result.message = f'{calibration.verdict}, written to {path}, report beside it'
-        if fitted.dark.verdict != 'OK':
-            result.message += f'; dark field {fitted.dark.verdict}: {fitted.dark.reason}'
-        if evidence.motor is not None:
-            result.message += (f'; motor: backlash {evidence.motor.backlash_counts:.0f}, repeats '
-                               f'to {evidence.motor.repeatability_counts:.0f} counts')
         if request.apply and calibration.verdict == 'OK':
             self._source.check(self._cancelled.is_set)
             self.active, self.refused = calibration, ''
             self._publish()
-            result.message += ' and active'
+            result.message += ', and active'
         elif request.apply:
             result.message += '; not made active, load it with ring_calibration/load to do so'
+        if fitted.dark.verdict != 'OK':
+            result.message += f'; dark field {fitted.dark.verdict}: {fitted.dark.reason}'
+        if evidence.motor is not None:
+            result.message += (f'; motor: backlash {evidence.motor.backlash_counts:.0f} counts, '
+                               f'repeats to {evidence.motor.repeatability_counts:.0f}')
 
     def _take_stacks(self, goal: ServerGoalHandle, stops: Sequence[tuple[float, Approach | None]],
                      target: RingTarget, keep: Path | None) -> list[Stack]:

@@ -1,6 +1,7 @@
 """What tests of the running graph share: an own ROS domain, and real data."""
 from collections.abc import Iterator
 import fcntl
+import itertools
 import os
 from pathlib import Path
 import tempfile
@@ -10,12 +11,20 @@ import pytest
 DATA = Path(os.environ.get('PS_DATA', Path(__file__).resolve().parents[2] / 'shared' / 'data'))
 
 
+DOMAINS = range(20, 100)
+_used = itertools.count()
+
+
 @pytest.fixture(scope='module')
 def ros_domain() -> Iterator[int]:
-    """A ROS domain that no other test of this user has, also not one of a parallel run."""
+    """A ROS domain that no other test of this user has, also not one of a parallel run.
+
+    Not the one before either: what its processes leave behind would be heard.
+    """
     saved = {name: os.environ.get(name) for name in (
         'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE')}
-    for domain in range(20, 100):
+    begin = next(_used)
+    for domain in (*DOMAINS[begin % len(DOMAINS):], *DOMAINS[:begin % len(DOMAINS)]):
         path = Path(tempfile.gettempdir()) / f'ps_test_domain_{os.getuid()}_{domain}.lock'
         with open(path, 'w') as lock:
             try:

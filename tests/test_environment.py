@@ -9,12 +9,14 @@ import pytest
 
 from ps_inspection.environment import cell_environment, fastdds_profile
 
-LARGEST_SEGMENT = """
-import re, rclpy
+LARGEST_SEGMENT = r"""
+import os, re, rclpy
+others = set(os.listdir('/dev/shm'))
 rclpy.init()
 node = rclpy.create_node('measured')
-sizes = [int(end, 16) - int(start, 16) for start, end in re.findall(
-    r'^([0-9a-f]+)-([0-9a-f]+) .*/dev/shm/fastrtps_', open('/proc/self/maps').read(), re.M)]
+sizes = [int(end, 16) - int(start, 16) for start, end, name in re.findall(
+    r'^([0-9a-f]+)-([0-9a-f]+) .*/dev/shm/(fastrtps_\S+)', open('/proc/self/maps').read(), re.M)
+    if name not in others]
 print(max(sizes, default=0))
 node.destroy_node()
 rclpy.try_shutdown()

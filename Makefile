@@ -23,8 +23,9 @@ setup:  ## make .venv and build the workspace (the others do this by themselves)
 demo: setup  ## run the whole cell on fake hardware and write build/demo/report.html
 	@$(IN_ENV) ps_demo --out '$(OUT)' $(if $(INPUT),--input '$(INPUT)')
 
-test: lint  ## lint, then every test
-	@$(IN_ENV) python -m pytest ros2_ws/src tests
+test: lint  ## lint, then every test; those of the graph one by one, as they are in real time
+	@$(IN_ENV) python -m pytest ros2_ws/src --numprocesses auto --maxprocesses 4 --dist loadfile
+	@$(IN_ENV) python -m pytest tests
 
 lint: setup  ## ruff everywhere, mypy over packages and scripts
 	@$(IN_ENV) ruff check .

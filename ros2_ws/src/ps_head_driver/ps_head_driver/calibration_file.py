@@ -28,7 +28,7 @@ from ps_head_driver.head_model import (
     parse_yaml,
     read_yaml,
 )
-from ps_head_driver.stack import Light, Mode
+from ps_head_driver.stack import Light, panel_name
 
 FORMAT = 'ps_head_calibration'
 VERSION = 2
@@ -126,8 +126,8 @@ class HeadCalibration(_Section):
 
     def covers(self, lights: Iterable[Light]) -> bool:
         """Whether every panel that is one of these lights alone has been calibrated."""
-        return all(f'{"DF" if light.mode is Mode.DARK_FIELD else "BF"}_{light.panel.name}'
-                   in self.panels for light in lights if light.is_equation)
+        return all(panel_name(light.mode, light.panel) in self.panels
+                   for light in lights if light.is_equation)
 
 
 def apply(head: HeadModel, calibration: HeadCalibration | None) -> HeadModel:

@@ -42,6 +42,11 @@ class Geometry(IntEnum):
     ASSUMED = 2
 
 
+def panel_name(mode: Mode, panel: Panel) -> str:
+    """As in 'BF_E', 'DF_ALL', 'BOTH_N'."""
+    return f'{("BF", "DF", "BOTH")[mode]}_{panel.name}'
+
+
 @dataclass(frozen=True)
 class Light:
     """The light of one frame, in ps_head_plane (metres).

@@ -5,7 +5,7 @@ import math
 
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.protocol import FULL_LEVEL, Step, StepRecord
-from ps_head_driver.stack import Light, Mode, Panel
+from ps_head_driver.stack import Light, Mode, Panel, panel_name
 
 LONGEST_S = 60.0
 _NOWHERE = (0.0, 0.0, 0.0)
@@ -27,7 +27,7 @@ class StrobeStep:
         """'BF_E', 'DF_ALL', 'BOTH_N', ... or 'NONE'."""
         if self.panel is Panel.NONE:
             return 'NONE'
-        return f'{("BF", "DF", "BOTH")[self.mode]}_{self.panel.name}'
+        return panel_name(self.mode, self.panel)
 
     @property
     def mask(self) -> int:

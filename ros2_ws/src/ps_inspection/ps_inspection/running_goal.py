@@ -5,6 +5,7 @@ from typing import Any
 
 from ps_head_driver.action_client import ActionClient
 from ps_head_driver.errors import ErrorCode, PsError
+from ps_head_driver.ros_support import wait_for_future
 
 
 class RunningGoal:
@@ -35,12 +36,11 @@ class RunningGoal:
         self._on_feedback(message.feedback)
 
     def _done(self, future: Any, timeout: float) -> Any:
-        done = threading.Event()
-        future.add_done_callback(lambda _: done.set())
-        if not done.wait(timeout):
+        answer = wait_for_future(future, timeout)
+        if answer is None:
             raise PsError(ErrorCode.INSPECTION_INTERNAL,
                           f'action {self._name}: no answer within {timeout:g} s')
-        return future.result()
+        return answer
 
     def wait_for(self, condition: Callable[[Any], bool], timeout: float) -> bool:
         """Wait for a feedback of a kind; whether one came, also before."""

@@ -1,5 +1,6 @@
 """The head driver as a process over DDS, with the fake head behind a real pseudo-terminal."""
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 import math
 import os
 from pathlib import Path
@@ -22,10 +23,13 @@ from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.parameter import Parameter  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
+from ps_head_driver.calibration_file import HeadCalibration as Calibrated  # noqa: E402
+from ps_head_driver.conversions import calibration_to_message  # noqa: E402
 from ps_head_driver.errors import ErrorCode  # noqa: E402
 from ps_head_driver.fake.trigger_socket import ControlClient, TriggerListener  # noqa: E402
+from ps_head_driver.head_model import load_head, nominal_head_path  # noqa: E402
 from ps_head_driver.ros_support import LATCHED, RELIABLE  # noqa: E402
-from ps_interfaces.msg import HeadStatus, Panel, StrobeStep  # noqa: E402
+from ps_interfaces.msg import HeadCalibration, HeadStatus, Panel, StrobeStep  # noqa: E402
 from ps_interfaces.srv import RunStrobeProgram, SetIllumination  # noqa: E402
 
 pytestmark = pytest.mark.graph
@@ -230,6 +234,36 @@ def test_parameters_are_checked_and_work_at_run_time(graph: Graph) -> None:
     start = time.monotonic()
     graph.call(SetIllumination, 'set_illumination', illuminate(by=MOVE, motor_counts=16000))
     assert time.monotonic() - start > 0.9
+
+
+def test_from_above_the_play_of_the_motor_is_made_up_for(graph: Graph) -> None:
+    graph.ready()
+    calibrated = graph.node.create_publisher(HeadCalibration, 'calibration', LATCHED)
+    nominal = load_head(nominal_head_path())
+    latched = calibration_to_message(Calibrated(
+        calibration_id='play', created=datetime.now(UTC), head_serial='', camera=nominal.camera,
+        backlash_counts=300, verdict='OK'), nominal)
+    by_cr = SetIllumination.Request(by=SetIllumination.Request.BY_CONVERGENCE_RADIUS,
+                                    convergence_radius=0.06)
+    below = graph.call(SetIllumination, 'set_illumination', by_cr)
+    try:
+        calibrated.publish(latched)
+        assert graph.call(SetParameters, NODE + '/set_parameters', SetParameters.Request(
+            parameters=[Parameter('approach', value='down').to_parameter_msg()])
+            ).results[0].successful
+        # the calibration arrives by another way than requests
+        deadline = time.monotonic() + 5.0
+        while True:
+            above = graph.call(SetIllumination, 'set_illumination', by_cr)
+            if above.motor_counts != below.motor_counts or time.monotonic() > deadline:
+                break
+        assert above.motor_counts == pytest.approx(below.motor_counts - 300, abs=4)
+        assert above.tilt == pytest.approx(below.tilt, abs=1e-4)
+        assert above.convergence_radius == pytest.approx(0.06, abs=1e-4)
+    finally:
+        graph.call(SetParameters, NODE + '/set_parameters', SetParameters.Request(
+            parameters=[Parameter('approach', value='up').to_parameter_msg()]))
+        calibrated.publish(calibration_to_message(None, nominal))
 
 
 def test_busy_is_refused_and_stop_gets_in(graph: Graph, control: ControlClient) -> None:

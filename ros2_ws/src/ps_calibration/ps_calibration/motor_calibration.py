@@ -7,7 +7,6 @@ down than after one up. What remains is the repeatability.
 """
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from scipy.optimize import least_squares
 from ps_calibration.calibrate import Calibration
 from ps_head_driver.calibration_file import MotorCorrection
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_head_driver.head_model import HeadModel
+from ps_head_driver.head_model import Approach, HeadModel
 from ps_head_driver.kinematics import BrightFieldKinematics
 from ps_head_driver.stack import Panel, Stack
 
@@ -24,7 +23,6 @@ from ps_head_driver.stack import Panel, Stack
 # three look much alike over a short range; wide, they would run away beyond it
 _PRIOR = np.array([500.0, 0.005, 0.015, 2000.0])
 _POSITIONS = 3                  # different ones, at least
-Approach = Literal['up', 'down']
 _TILT_NOISE = 1e-4              # rad, of a tilt from a ring calibration
 
 

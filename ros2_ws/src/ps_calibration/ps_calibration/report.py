@@ -18,7 +18,7 @@ from ps_calibration import report_figures as figures
 from ps_calibration.before_after import Comparison
 from ps_calibration.calibrate import Calibration, head_calibration
 from ps_calibration.dark_field_report import dark_field_section
-from ps_calibration.motor_calibration import Approach, MotorCalibration, motor_of
+from ps_calibration.motor_calibration import MotorCalibration, motor_of
 from ps_calibration.repeatability import Repeatability, repeatability, repeats
 from ps_calibration.report_parts import figure, single_pictures
 from ps_calibration.ring_height import height_map, wall_height
@@ -28,7 +28,7 @@ from ps_calibration.shadow_maps import edge_profile, shadow_maps
 from ps_calibration.uncertainty import light_figures
 from ps_head_driver.calibration_file import HeadCalibration, new_calibration_id
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_head_driver.head_model import DIRECTIONS, HeadModel
+from ps_head_driver.head_model import DIRECTIONS, Approach, HeadModel
 from ps_head_driver.stack import Mode, Stack
 from ps_reconstruction.html_report import page
 

@@ -20,6 +20,7 @@ import yaml
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.head_model import (
     DIRECTIONS,
+    Approach,
     BrightField,
     CameraGeometry,
     Direction,
@@ -56,8 +57,8 @@ class PanelCorrection(_Section):
 class MotorCorrection(_Section):
     """How the crank-slider as made differs from the nominal one.
 
-    Holds for positions that are approached as they were when it was measured (upwards, as
-    head_driver does by default).
+    Holds for positions that are approached upwards, as head_driver does by default; see
+    :func:`apply` for the others.
     """
 
     offset_counts: float = 0.0                           # to add to the counts at m0_counts
@@ -130,10 +131,13 @@ class HeadCalibration(_Section):
                    for light in lights if light.is_equation)
 
 
-def apply(head: HeadModel, calibration: HeadCalibration | None) -> HeadModel:
+def apply(head: HeadModel, calibration: HeadCalibration | None,
+          approach: Approach = 'up') -> HeadModel:
     """The head as calibrated: panels and crank-slider corrected, camera and backlash replaced.
 
     :param calibration: None leaves the head as it is (nominal geometry).
+    :param approach: last direction of the motor. After a motion down, the slider stands as if it
+        had ``backlash_counts`` more; a calibration that has measured no backlash has 0.
     """
     if calibration is None:
         return head
@@ -150,7 +154,11 @@ def apply(head: HeadModel, calibration: HeadCalibration | None) -> HeadModel:
                 'intensity': old.intensity * fix.intensity})
         return result
 
-    bright, dark = calibration.motor.corrected(head.bright_field), head.dark_field
+    motor = calibration.motor
+    if approach == 'down':
+        motor = motor.model_copy(
+            update={'offset_counts': motor.offset_counts + calibration.backlash_counts})
+    bright, dark = motor.corrected(head.bright_field), head.dark_field
     return head.model_copy(update={
         'camera': calibration.camera,
         'bright_field': bright.model_copy(update={'panels': corrected('BF', bright.panels)}),

@@ -12,6 +12,8 @@ from ps_head_driver.errors import ErrorCode, PsError
 
 Direction = Literal['E', 'N', 'W', 'S']
 DIRECTIONS: tuple[Direction, ...] = ('E', 'N', 'W', 'S')
+Approach = Literal['up', 'down']                  # last direction of the motor
+APPROACHES: tuple[Approach, ...] = ('up', 'down')
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]

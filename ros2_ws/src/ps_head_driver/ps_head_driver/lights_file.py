@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from ps_head_driver.errors import ErrorCode
-from ps_head_driver.head_model import parse_yaml, read_yaml
+from ps_head_driver.head_model import Approach, parse_yaml, read_yaml
 
 Vector = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
@@ -96,7 +96,7 @@ class LightsFile(_Section):
 
     camera: CameraSection | None = None
     motor_counts: int | None = None
-    approach: Literal['up', 'down'] | None = None
+    approach: Approach | None = None
     plane: PlaneSection = PlaneSection()
     geometry: Literal['NOMINAL', 'CALIBRATED', 'ASSUMED'] = 'NOMINAL'
     stack_id: str = ''

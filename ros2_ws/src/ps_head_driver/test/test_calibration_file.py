@@ -54,6 +54,9 @@ def test_corrections_reach_the_head(calibration):
     # counts mean what the corrected slider makes of them
     found, nominal = (BrightFieldKinematics(each) for each in (fixed, head))
     assert found.tilt(20000) == pytest.approx(nominal.tilt(20000 * 1.002 + 150 * 1.002))
+    # and after a motion down, what its play makes of them
+    above = BrightFieldKinematics(apply(head, calibration, 'down'))
+    assert above.tilt(20000) == pytest.approx(found.tilt(20000 + 80))
 
 
 def test_a_stack_is_calibrated_if_all_its_panels_are(calibration):

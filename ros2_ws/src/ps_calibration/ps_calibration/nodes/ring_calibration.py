@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 
 from ps_calibration.calibrate import calibrate
 from ps_calibration.catalogue import list_calibrations
-from ps_calibration.motor_calibration import Approach, visits
+from ps_calibration.motor_calibration import visits
 from ps_calibration.motor_side import MotorSide
 from ps_calibration.report import gather, report, write_report
 from ps_calibration.ring_pictures import common_camera
@@ -23,7 +23,7 @@ from ps_head_driver import ros_support
 from ps_head_driver.calibration_file import HeadCalibration, read_calibration, write_calibration
 from ps_head_driver.conversions import calibration_to_message
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_head_driver.head_model import load_head, nominal_head_path
+from ps_head_driver.head_model import Approach, load_head, nominal_head_path
 from ps_head_driver.paths import confined
 from ps_head_driver.ros_support import Parameter, answers
 from ps_head_driver.stack import Panel, Stack

@@ -27,9 +27,10 @@ from ps_head_driver.flat_field import FlatField, make_flat_field
 from ps_head_driver.frames import OPTICAL_FRAME
 from ps_head_driver.head_model import CameraGeometry, load_head, nominal_head_path
 from ps_head_driver.head_services import HeadServices
+from ps_head_driver.kinematics import BrightFieldKinematics
 from ps_head_driver.recipes import Recipe, load_recipes
 from ps_head_driver.ros_support import Parameter, answers
-from ps_head_driver.stack import Geometry, Panel, Plane, Pose, Stack, with_exposure_scale
+from ps_head_driver.stack import Geometry, Mode, Panel, Plane, Pose, Stack, with_exposure_scale
 from ps_interfaces import msg as ps
 from ps_interfaces.action import AcquireStack
 from ps_interfaces.srv import Capture, CaptureFlat
@@ -313,7 +314,11 @@ class CameraSequencer(Node):
             plane=Plane(calibration.plane_normal, calibration.plane_offset)
             if calibration else Plane())
         try:
-            solution = convergence_radius.forward(head, taken.lights[0].motor_counts)
+            # from above, the panels stand as if at more counts: their tilt tells
+            tilts = [light.tilt for light in taken.lights if light.mode == Mode.BRIGHT_FIELD]
+            counts = (BrightFieldKinematics(head).motor_counts(tilts[0]) if tilts
+                      else taken.lights[0].motor_counts)
+            solution = convergence_radius.forward(head, counts)
             stack = replace(stack, convergence_radius=solution.convergence_radius,
                             light_height=solution.light_height)
         except PsError:

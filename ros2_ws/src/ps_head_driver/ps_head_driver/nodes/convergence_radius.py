@@ -6,7 +6,7 @@ from ps_head_driver.calibration_file import apply
 from ps_head_driver.convergence_radius import Branch, CrSolver
 from ps_head_driver.conversions import light_to_message, message_to_calibration
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_head_driver.head_model import HeadModel, load_head, nominal_head_path
+from ps_head_driver.head_model import APPROACHES, HeadModel, load_head, nominal_head_path
 from ps_head_driver.kinematics import lights_at
 from ps_head_driver.ros_support import Parameter, answers
 from ps_interfaces import msg as ps
@@ -14,6 +14,8 @@ from ps_interfaces.srv import SolveConvergenceRadius
 
 PARAMETERS = [
     Parameter('head_file', '', 'Head geometry (YAML); empty: the nominal head', read_only=True),
+    Parameter('approach', 'up', "Last direction of the moves; as head_driver's", read_only=True,
+              choices=APPROACHES),
 ]
 
 
@@ -40,7 +42,8 @@ class ConvergenceRadius(Node):
 
     def _on_calibration(self, message: ps.HeadCalibration) -> None:
         try:
-            self._use(apply(self._drawn, message_to_calibration(message)))
+            self._use(apply(self._drawn, message_to_calibration(message),
+                            self.parameters['approach']))
             self.calibration_id = message.calibration_id
         except PsError as error:
             self.get_logger().error(f'calibration refused: {error.message}')

@@ -20,7 +20,13 @@ from ps_head_driver.fake.trigger_socket import default_path
 from ps_head_driver.frames import PLANE_FRAME
 from ps_head_driver.head_client import PANEL_NAMES, HeadClient, HeadState, Motion
 from ps_head_driver.head_frames import BRIGHT_FIELD_JOINT, DARK_FIELD_JOINT
-from ps_head_driver.head_model import HeadModel, load_head, nominal_head_path
+from ps_head_driver.head_model import (
+    APPROACHES,
+    Approach,
+    HeadModel,
+    load_head,
+    nominal_head_path,
+)
 from ps_head_driver.head_supervisor import HeadSupervisor, Phase, Settings, Snapshot
 from ps_head_driver.kinematics import BrightFieldKinematics, lights_at
 from ps_head_driver.ros_support import Parameter, answers
@@ -47,7 +53,7 @@ PARAMETERS = [
               read_only=True),
     Parameter('home_on_activation', True, 'Home by itself whenever the board does not know its '
               'position'),
-    Parameter('approach', 'up', 'Last direction of every move', choices=('up', 'down')),
+    Parameter('approach', 'up', 'Last direction of every move', choices=APPROACHES),
     Parameter('overshoot', 400, 'Way beyond the target when coming from the wrong side; more than '
               'the backlash', 'counts', 0, 5000, read_only=True),
     Parameter('in_position', 4, 'Allowed error of a finished move', 'counts', 0, 1000),
@@ -67,7 +73,9 @@ class HeadDriver(LifecycleNode):
         self.parameters = ros_support.Parameters(
             self, PARAMETERS, ErrorCode.HEAD_BAD_REQUEST, self._on_parameters)
         self._head: HeadModel | None = None           # nominal
-        self._calibrated: HeadModel | None = None     # with the active calibration
+        # with the active calibration, by the side from which the motor has arrived
+        self._calibrated: dict[Approach, HeadModel] = {}
+        self._arrived: Approach = self.parameters['approach']
         self._calibration: ps.HeadCalibration | None = None
         self._emulator: EmulatorChild | None = None
         self._links: list[SerialLink] = []
@@ -141,7 +149,7 @@ class HeadDriver(LifecycleNode):
 
     def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Forget the head file."""
-        self._head = self._calibrated = None
+        self._head, self._calibrated = None, {}
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, _state: LifecycleState) -> TransitionCallbackReturn:
@@ -186,12 +194,12 @@ class HeadDriver(LifecycleNode):
     def _use_calibration(self) -> None:
         if self._head is not None:
             calibration = message_to_calibration(self._calibration) if self._calibration else None
-            self._calibrated = apply(self._head, calibration)
+            self._calibrated = {side: apply(self._head, calibration, side) for side in APPROACHES}
 
     def _active(self) -> tuple[HeadSupervisor, HeadModel]:
-        if self._supervisor is None or self._calibrated is None:
+        if self._supervisor is None or not self._calibrated:
             raise _not_active()
-        return self._supervisor, self._calibrated
+        return self._supervisor, self._calibrated[self._arrived]
 
     # ------------------------------------------------------------------ requests
 
@@ -225,10 +233,13 @@ class HeadDriver(LifecycleNode):
         if tilt and not low <= tilt <= high:
             raise PsError(ErrorCode.HEAD_BAD_REQUEST,
                           f'dark_field_tilt: {tilt} is not within {low} to {high} rad')
-        target = self._target_of(request, head)
+        motion = self._settings.motion
+        side: Approach = 'up' if motion.approach_up else 'down'
+        target = self._target_of(request, self._calibrated[side])
         with supervisor.operation(homed=True) as client:
             if target is not None:
-                client.move_to(target, self._settings.motion, self.parameters['move_timeout'])
+                self._arrived, head = side, self._calibrated[side]
+                client.move_to(target, motion, self.parameters['move_timeout'])
             if tilt:
                 client.set_df_tilt(tilt)
             if request.intensities:
@@ -305,7 +316,7 @@ class HeadDriver(LifecycleNode):
 
     def _geometry(self, state: HeadState) -> tuple[float, float]:
         """(tilt, CR) of a state; computed when the motor has moved."""
-        head = self._calibrated
+        head = self._calibrated.get(self._arrived)
         if head is None or not state.homed:
             return math.nan, math.nan
         if self._position is None or self._position[:2] != (head, state.motor_counts):

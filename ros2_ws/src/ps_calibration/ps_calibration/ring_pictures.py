@@ -17,6 +17,8 @@ from ps_head_driver.kinematics import BrightFieldKinematics
 from ps_head_driver.stack import Light, Mode, Panel, Stack
 
 _SATURATED = 0.002       # part of the pixels at the end of the range
+_BLOCKS = 16             # a side, that tell how bright the plate is around a saturated pixel
+_GLINT = 0.8             # of a saturated pixel's value: a plate darker than this is not too bright
 _DARK = 0.05             # mean of a picture, relative to the end of its range
 _DEAD = 0.3              # of the mean of the four panels
 MOVED_PX = 0.3           # of a dot, between two pictures
@@ -133,6 +135,19 @@ def without_room(stack: Stack, panel: Panel, mode: Mode, room: NDArray,
     return grey, burnt
 
 
+def _remedy_for_saturation(picture: NDArray, burnt: NDArray) -> str:
+    """Glints stand out of a plate that is well exposed; else the plate itself is too bright."""
+    height, width = (np.array(picture.shape) // _BLOCKS).clip(1)
+    whole = np.s_[:height * _BLOCKS, :width * _BLOCKS]
+    picture, burnt = picture[whole], burnt[whole]
+    blocks = picture.reshape(_BLOCKS, height, _BLOCKS, width)
+    around = np.median(blocks, axis=(1, 3)).repeat(height, 0).repeat(width, 1)
+    if np.mean(around[burnt] < _GLINT * np.median(picture[burnt])) > 0.5:
+        return (' in scattered spots; clean the target and see that it is matt, or, if it is, '
+                'lower the exposure')
+    return '; lower its exposure'
+
+
 def light_only(stack: Stack) -> list[NDArray]:
     """E, N, W, S at equal exposure, without the light of the room.
 
@@ -144,7 +159,8 @@ def light_only(stack: Stack) -> list[NDArray]:
     for panel in (Panel.E, Panel.N, Panel.W, Panel.S, Panel.ALL):
         picture, burnt = without_room(stack, panel, Mode.BRIGHT_FIELD, room)
         if burnt.mean() > _SATURATED:
-            raise PsError(code, f'{name}: frame {panel.name} is saturated; lower its exposure')
+            raise PsError(code, f'{name}: frame {panel.name} is saturated'
+                                f'{_remedy_for_saturation(picture, burnt)}')
         frames.append(picture)
     singles, together = frames[:4], frames[4]
     means = np.array([float(frame.mean()) for frame in singles])

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from ps_calibration.ring_target import RingTarget
 from ps_calibration.setup_hint import SetupHint, setup_hint
 from ps_calibration.synthetic import Bench
+from ps_calibration.synthetic_dirt import glints
 from ps_calibration.synthetic_faults import E, N, S, W
 from ps_head_driver.errors import ErrorCode, PsError
 from ps_head_driver.stack import Stack
@@ -38,3 +39,18 @@ def test_saturated_pictures_are_called_so(stack: Stack, target: RingTarget) -> N
     with pytest.raises(PsError, match='saturated') as refused:
         setup_hint(replace(stack, images=burnt), target, stack.camera)
     assert refused.value.code is ErrorCode.CALIBRATION_CAPTURE_FAILED
+    assert 'lower its exposure' in refused.value.message
+    assert 'clean' not in refused.value.message
+
+
+def test_dirt_that_glints_is_to_be_cleaned(stack: Stack, target: RingTarget) -> None:
+    with pytest.raises(PsError, match='scattered spots; clean the target'):
+        setup_hint(glints(stack, 160), target, stack.camera)
+
+
+def test_a_plate_just_at_the_end_of_the_range_is_not_called_dirty(
+        stack: Stack, target: RingTarget) -> None:
+    bright = [np.clip(np.round(1.02 * 255 / np.quantile(image, 0.95) * image), 0, 255).astype(
+        np.uint8) if k == E else image for k, image in enumerate(stack.images)]
+    with pytest.raises(PsError, match='frame E is saturated; lower its exposure'):
+        setup_hint(replace(stack, images=bright), target, stack.camera)

@@ -33,6 +33,8 @@ def cell_environment(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
       for all threads, because mapping and zeroing fresh pages for every stack costs more than
       copying it.
     * OMP_WAIT_POLICY: threads of one process that wait for work leave the cores to the others.
+    * OPENBLAS_NUM_THREADS: its threads wait for each other by spinning; when another process has
+      the core, a product of matrices that takes 5 ms takes seconds.
     """
     defaults = {
         'FASTRTPS_DEFAULT_PROFILES_FILE': str(fastdds_profile()),
@@ -40,6 +42,7 @@ def cell_environment(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
         'MALLOC_TRIM_THRESHOLD_': '4000000000',
         'MALLOC_ARENA_MAX': '1',
         'OMP_WAIT_POLICY': 'PASSIVE',
+        'OPENBLAS_NUM_THREADS': '1',
     }
     return {name: environ.get(name) or value for name, value in defaults.items()}
 

@@ -59,10 +59,10 @@ def _sampling_error() -> Table:
                     vectors = []
                     for count, gauss in ((MATT, True), (DENSE, False)):
                         samples, _ = emitters(pose, count, gauss)
-                        d = samples[:, :3] - point
+                        d = samples[:3].T - point
                         r = np.linalg.norm(d, axis=1, keepdims=True)
                         cosine = np.maximum(-(d @ pose.axis)[:, None] / r, 0)
-                        vectors.append(np.sum(cosine * d / r ** 3 * samples[:, 3:], axis=0))
+                        vectors.append(np.sum(cosine * d / r ** 3 * samples[3, :, None], axis=0))
                     angles.append(angular_error_deg(*vectors))
                     losses.append(abs(vectors[0][2] / vectors[1][2] - 1))
             table.add_row(name, str(tilt), f'{max(angles):.5f}', f'{max(losses):.1e}')

@@ -79,10 +79,10 @@ def test_sampling_error_of_the_light_vector(ring, tilt):
     """The emitters that the camera sums against many more, over the field of view."""
     def vector(pose, point, count):
         samples, _ = emitters(pose, count, gauss=count == MATT)
-        d = samples[:, :3] - point
+        d = samples[:3].T - point
         r = np.linalg.norm(d, axis=1, keepdims=True)
         cosine = np.maximum(-(d @ pose.axis)[:, None] / r, 0)
-        return np.sum(cosine * d / r ** 3 * samples[:, 3:], axis=0)
+        return np.sum(cosine * d / r ** 3 * samples[3, :, None], axis=0)
 
     worst = 0.0
     for direction in DIRECTIONS:
@@ -123,7 +123,7 @@ def test_cast_shadow_of_a_step_has_the_penumbra_of_the_panel():
     x, y, z = (values[row] for values in seen_points(renderer))
     low = (z < -drop + 1e-6) & (x < edge - 1e-4)
     measured = (renderer.panel_radiance(pose)[row] / flat.panel_radiance(pose)[row])[low]
-    positions = emitters(pose, (60, 60), gauss=False)[0][:, :3]
+    positions = emitters(pose, (60, 60), gauss=False)[0][:3].T
     expected = []
     for point in np.stack([x, y, z], axis=-1)[low]:
         d = positions - point

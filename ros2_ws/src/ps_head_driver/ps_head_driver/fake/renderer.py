@@ -93,7 +93,7 @@ def emitters(pose: PanelPose, count: tuple[int, int], gauss: bool) -> tuple[NDAr
     :param count: emitters along width and height.
     :param gauss: at the nodes of Gauss-Legendre quadrature, the most exact where the integrand is
         smooth; otherwise at the centres of equal parts.
-    :returns: (E, 4) positions and areas, and the panel as shading.shade wants it (6, 3).
+    :returns: (4, E) positions and areas, and the panel as shading.shade wants them (6, 3).
     """
     rules = [np.polynomial.legendre.leggauss(n) if gauss
              else ((2 * np.arange(n) + 1) / n - 1, np.full(n, 2 / n)) for n in count]
@@ -107,8 +107,8 @@ def emitters(pose: PanelPose, count: tuple[int, int], gauss: bool) -> tuple[NDAr
     azimuth = math.atan2(pose.center[1], pose.center[0])
     forward = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
     sideways = np.array([-forward[1], forward[0], 0.0])
-    part = np.array([width / count[0], height / count[1], pose.lobe_exponent])
-    return (samples.reshape(-1, 4),
+    part = np.array([width / count[0], height / count[1], 0.0])
+    return (np.ascontiguousarray(samples.reshape(-1, 4).T),
             np.stack([pose.axis, pose.right, up, part, sideways, forward]))
 
 

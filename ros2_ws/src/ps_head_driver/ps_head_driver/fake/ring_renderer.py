@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from ps_head_driver.camera_model import camera_center, pixel_rays
 from ps_head_driver.errors import ErrorCode, PsError
+from ps_head_driver.fake.kernels import KERNEL_LOCK
 from ps_head_driver.fake.renderer import OFF, Renderer, Sensor, emitters
 from ps_head_driver.fake.scenes import checked_arguments
-from ps_head_driver.fake.shading import KERNEL_LOCK
 from ps_head_driver.head_model import HeadModel
 from ps_head_driver.kinematics import PanelPose
 from ps_head_driver.stack import Truth

@@ -1,7 +1,7 @@
 """What can lie under the fake head: surfaces with known height and reflectance.
 
 The plane z = 0 of ps_head_plane is where a part's upper face should be. Every scene is a grid of
-control heights of a cubic B-spline (see shading.py), which is its exact surface.
+control heights of a cubic B-spline (see spline_surface.py), which is its exact surface.
 """
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_head_driver.fake import finishes, shading, shapes
+from ps_head_driver.fake import finishes, shapes
 from ps_head_driver.fake.disc import machined_disc
+from ps_head_driver.fake.spline_surface import evaluate
 
 SIZE = (0.064, 0.054)        # m; the nominal field of view is 50 x 40 mm
 PITCH = 5e-5                 # m; a pixel of the nominal camera sees 39 um
@@ -67,7 +68,7 @@ class Scene:
         :returns: z (m), dz/dx, dz/dy, same shape, float64.
         """
         x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
-        z, p, q = shading.evaluate(
+        z, p, q = evaluate(
             self.height, *self.origin, self.pitch, x.ravel(), y.ravel()).reshape(3, *x.shape)
         return z, p, q
 

@@ -5,9 +5,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ps_head_driver.camera_model import pixel_rays, scaled_camera
-from ps_head_driver.fake import shading
+from ps_head_driver.fake.kernels import KERNEL_LOCK
 from ps_head_driver.fake.renderer import Renderer, Sensor, corners, emitters
 from ps_head_driver.fake.scenes import SIZE, Scene, make_scene
+from ps_head_driver.fake.shading import shade
+from ps_head_driver.fake.shadows import shadow_ground
+from ps_head_driver.fake.spline_surface import intersect
 from ps_head_driver.frames import slope_to_normal
 from ps_head_driver.head_model import CameraGeometry, HeadModel
 from ps_head_driver.kinematics import PanelPose
@@ -44,11 +47,12 @@ class SurfaceRenderer(Renderer):
         self.scene = scene
         rays = camera_rays(self.camera)
         scene.require_covers(rays, self.camera.camera_standoff)
-        with shading.KERNEL_LOCK:
-            self._points = shading.intersect(
+        with KERNEL_LOCK:
+            self._points = intersect(
                 scene.height, scene.albedo, *scene.origin, scene.pitch, *scene.height_range,
                 *rays, self.camera.camera_standoff)
-        self._shadow_grids = shading.shadow_grids(scene.height, *scene.origin, scene.pitch)
+        self._ground = shadow_ground(scene.height, scene.height_range[1], *scene.origin,
+                                     scene.pitch)
 
     @property
     def albedo(self) -> NDArray:
@@ -70,13 +74,13 @@ class SurfaceRenderer(Renderer):
 
     def _shade(self, points: NDArray, pose: PanelPose) -> NDArray:
         scene = self.scene
-        with shading.KERNEL_LOCK:
-            return np.asarray(shading.shade(
-                points, scene.specular, scene.roughness,
+        lobe = None if pose.lobe_exponent == 1 else pose.lobe_exponent
+        with KERNEL_LOCK:
+            return np.asarray(shade(
+                points, (scene.specular, scene.roughness), lobe,
                 *emitters(pose, GLOSSY if scene.specular else MATT, gauss=True),
                 *emitters(pose, PARTIAL, gauss=False), corners(pose), pose.intensity,
-                *self._shadow_grids, scene.height_range[1], *scene.origin, scene.pitch,
-                self.camera.camera_standoff))
+                *self._ground, self.camera.camera_standoff))
 
 
 def make_surface_renderer(name: str, arguments: dict[str, Any], head: HeadModel,

@@ -357,7 +357,7 @@ class RingRenderer(Renderer):
     def _irradiance(self, points: NDArray, pose: PanelPose) -> NDArray:
         """Irradiance of points in the target frame under a panel of unit radiance, (N,)."""
         where = self._where
-        free = emitters(pose, _FREE, gauss=True)[0]
+        free = emitters(pose, _FREE, gauss=True)[0].T.copy()
         free[:, :3] = (free[:, :3] - where.position) @ where.rotation
         sides = np.stack([pose.size[0] * pose.right,
                           pose.size[1] * np.cross(pose.axis, pose.right)])

@@ -16,6 +16,7 @@ from ps_calibration.ring_fit import (
     blocked_slits,
     corrected,
     fit_ring,
+    free_height,
     predicted_shares,
 )
 from ps_calibration.ring_pictures import (
@@ -107,7 +108,7 @@ def calibrate(stacks: Sequence[Stack], target: RingTarget, head: HeadModel) -> C
             require_labels(position, predicted_shares(head, target, camera, position, pose))
         fit = fit_ring(head, target, camera, shares, dots_px, pose)
         clock['fit'] = time.perf_counter()
-        free = fit_ring(head, target, camera, shares, dots_px, pose, fit, free_height=True)
+        free = free_height(fit, head, target, camera, shares, dots_px)
         clock['z_scale'] = time.perf_counter()
     except PsError as error:
         if error.code not in (ErrorCode.CALIBRATION_TARGET_NOT_FOUND,

@@ -10,9 +10,9 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import OptimizeResult, least_squares
 
 from ps_calibration.detection import displacement
+from ps_calibration.gauss_newton import NormalEquations, minimise
 from ps_calibration.plate_light import (
     PlateLight,
     free_light,
@@ -24,10 +24,9 @@ from ps_calibration.ring_fit import RingFit
 from ps_calibration.ring_pictures import MOVED_PX, room_light, stated_tilt, without_room
 from ps_calibration.ring_problem import (
     PANEL_PRIOR,
-    PANEL_STEPS,
     PER_PANEL,
-    POINT_STEP,
     SOFT,
+    STEP,
     corrected,
     rigid_motion,
 )
@@ -263,26 +262,16 @@ class _Problem:
         light = light_of(self.panel(x), self.points, self.target)
         return np.asarray((self.values - light) / self.noise)
 
-    def residuals(self, x: NDArray) -> NDArray:
-        return np.concatenate([SOFT * soft(-self.left(x) / SOFT)[0],
-                               (x - self.start) / _PRIOR])
-
-    def jacobian(self, x: NDArray) -> NDArray:
+    def equations(self, x: NDArray) -> NormalEquations:
         panel = self.panel(x)
-        light, by_motion = light_and_rates(self.points, panel, self.target.height,
-                                           self.target.footprint)
-        slope = soft((light * panel.intensity - self.values) / self.noise / SOFT)[1] / self.noise
-        columns = []
-        for k in range(PER_PANEL - 1):
-            step = 0.1 * PANEL_STEPS[k]
-            moved = self.panel(x + step * np.eye(PER_PANEL)[k])
-            columns.append(by_motion @ rigid_motion(panel, moved) / step)
-        rates = panel.intensity * slope * np.stack([*columns, light])
-        return np.concatenate([rates, np.diag(1 / _PRIOR)], axis=1).T
-
-    def solve(self, x: NDArray) -> OptimizeResult:
-        return least_squares(self.residuals, x, self.jacobian, method='lm', max_nfev=30,
-                             x_scale=10 * PANEL_STEPS, xtol=1e-8, ftol=1e-6)
+        light, by = light_and_rates(self.points, panel, self.target.height, self.target.footprint)
+        motions = np.stack([rigid_motion(panel, self.panel(x + step)) / STEP
+                            for step in STEP * np.eye(PER_PANEL)[:-1]])
+        left, slope = soft((panel.intensity * light - self.values) / (self.noise * SOFT))
+        rates = np.concatenate([motions @ by[:, :6].T, light[None]])
+        rates *= panel.intensity * slope / self.noise
+        return NormalEquations.of(SOFT * left, rates) + NormalEquations.of(
+            (x - self.start) / _PRIOR, np.diag(1 / _PRIOR))
 
 
 def fit_panel(i: int, light: PlateLight, tilt: float, usual: float, pose: TargetPose,
@@ -298,17 +287,16 @@ def fit_panel(i: int, light: PlateLight, tilt: float, usual: float, pose: Target
     """
     place = (i, light, tilt, usual, pose, head, target)
     thin, problem = _Problem(*place, part=_THIN), _Problem(*place)
-    fit = thin.solve(thin.start)
+    x, _ = minimise(thin.equations, thin.start)
     # what averaging over a block adds to the light in its middle
     known = np.isfinite(light.values[i])
-    panel = problem.panel(fit.x)
+    panel = problem.panel(x)
     problem.values = problem.values - (
         mean_light(panel, light.corners, target)[known] - light_of(panel, problem.points, target))
-    fit = problem.solve(fit.x)
-    x, panel = fit.x, problem.panel(fit.x)
-    left = problem.left(x)
+    x, equations = minimise(problem.equations, x)
+    panel, left = problem.panel(x), problem.left(x)
     scatter = max(1.4826 * float(np.median(abs(left))), 1.0)
-    covariance = np.linalg.inv(fit.jac.T @ fit.jac) * scatter**2
+    covariance = equations.covariance() * scatter**2
     free = free_light(panel, problem.points)
     seen = light_of(panel, problem.points, target) / free
     shaded = int(np.sum((seen > _SOFT_SHADOW[0]) & (seen < _SOFT_SHADOW[1])))
@@ -330,9 +318,8 @@ def fit_panel(i: int, light: PlateLight, tilt: float, usual: float, pose: Target
 
 def _edge(problem: _Problem, panel: PanelPose, left: NDArray) -> float:
     """What is left, as a shift of the shadow edges, m."""
-    here = light_of(panel, problem.points, problem.target)
-    slopes = [(light_of(panel, problem.points + shift, problem.target) - here)
-              / POINT_STEP for shift in POINT_STEP * np.eye(2)]
-    steep = np.hypot(*slopes) / problem.noise
+    _, by = light_and_rates(problem.points, panel, problem.target.height,
+                            problem.target.footprint)
+    steep = panel.intensity * np.hypot(by[:, 6], by[:, 7]) / problem.noise
     edges = steep > 0.3 * steep.max()
     return float(np.sqrt(np.sum(left[edges]**2) / np.sum(steep[edges]**2)))

@@ -10,18 +10,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import OptimizeResult, least_squares
 
+from ps_calibration.gauss_newton import NormalEquations, minimise
 from ps_calibration.ring_problem import PER_PANEL, RingProblem, corrected
 from ps_calibration.ring_target import RingTarget
 from ps_calibration.shares import Shares
 from ps_calibration.target_pose import TargetPose
 from ps_head_driver.head_model import CameraGeometry, HeadModel
 
-__all__ = ['PER_PANEL', 'RingFit', 'blocked_slits', 'corrected', 'fit_ring', 'predicted_shares']
+__all__ = ['PER_PANEL', 'RingFit', 'blocked_slits', 'corrected', 'fit_ring', 'free_height',
+           'predicted_shares']
 
 _THIN = 6                # one block in so many gets the fit close
-_CLOSE = 0.05            # heights of the wall, relative, between which one step is enough
+_CLOSE = 0.02            # of the wall's height: up to there one step finds a free one
 
 
 @dataclass(frozen=True)
@@ -32,18 +33,17 @@ class RingFit:
         multiply.
     :param tilts: per position, rad, nominal plus the fitted error of the motor.
     :param pose: of the target.
-    :param height: of the wall, m: fitted or as given.
+    :param height: of the wall, m: as given, or fitted, see free_height.
     :param height_deviation: its standard deviation, 0 if it was given.
     :param softness: of the pictures: variance of their blur over that of the blocks.
     :param residuals: per position (4, N) measured minus predicted share.
     :param edge_px: per position (4,) what the residuals amount to as a shift of the shadow edges.
     :param scatter: of the residuals relative to the noise expected, robust, at least 1.
-    :param deviation: (4, PER_PANEL) standard deviations from the covariance.
-    :param pose_deviation: (SIZE,) the same of the pose.
-    :param covariance: (4 PER_PANEL + SIZE,) squared, of all of these, panels first.
+    :param covariance: (4 PER_PANEL + SIZE,) squared, of panels and pose.
     :param condition: of the fit, largest over smallest singular value, every parameter in units
         of its deviation if it were the only one; without the four panels' common intensity, which
         no picture tells.
+    :param equations: at the end of the fit, by all parameters of RingProblem.
     """
 
     panels: NDArray
@@ -55,15 +55,19 @@ class RingFit:
     residuals: list[NDArray]
     edge_px: list[NDArray]
     scatter: float
-    deviation: NDArray
-    pose_deviation: NDArray
     covariance: NDArray
     condition: float
+    equations: NormalEquations
+
+    @property
+    def deviation(self) -> NDArray:
+        """Standard deviations of the panels' corrections, (4, PER_PANEL)."""
+        own = np.diag(self.covariance)[:4 * PER_PANEL]
+        return np.sqrt(own).reshape(4, PER_PANEL)
 
 
 def fit_ring(head: HeadModel, target: RingTarget, camera: CameraGeometry,
-             shares: Sequence[Shares], dots_px: NDArray, pose: TargetPose,
-             start: RingFit | None = None, free_height: bool = False) -> RingFit:
+             shares: Sequence[Shares], dots_px: NDArray, pose: TargetPose) -> RingFit:
     """Fit panels and target to the shares of all motor positions.
 
     :param head: as designed, or as calibrated before.
@@ -71,79 +75,64 @@ def fit_ring(head: HeadModel, target: RingTarget, camera: CameraGeometry,
     :param shares: one per motor position, as from measure_shares.
     :param dots_px: (F, 2) dots in the pictures.
     :param pose: of the target, to start from.
-    :param start: an earlier fit to start from instead.
-    :param free_height: fit the height of the wall, too: a check of the scale of z.
     """
-    thin = [share.thinned(_THIN) for share in shares]
-    problem = RingProblem(head, target, camera, thin, dots_px, free_height)
-    if start is None:
-        x = problem.start(np.zeros((4, PER_PANEL)), pose, [share.tilt for share in shares])
-    else:
-        x = problem.start(start.panels, start.pose, start.tilts, start.softness)
-        problem.learn_blur(x)
-    fit = _solve(problem, x)
-    if free_height:
-        found = _summary(problem, fit.x, fit.jac)
-        near = start is not None and abs(found.height / target.height - 1) < _CLOSE
-        return _whole_height(found, head, target, camera, shares, dots_px) if near else found
+    thin = RingProblem(head, target, camera, _thinned(shares), dots_px)
+    x = thin.start(np.zeros((4, PER_PANEL)), pose, [share.tilt for share in shares])
+    x, _ = minimise(thin.equations, x, thin.size - 1)
     # what remains tells how far to trust the shadows and the rest
     problem = RingProblem(head, target, camera, [
         share.reweighed(difference)
-        for share, difference in zip(shares, problem.differences(fit.x), strict=True)], dots_px)
-    problem.learn_blur(fit.x)
-    fit = _solve(problem, fit.x)
-    return _summary(problem, fit.x, fit.jac)
-
-
-def _whole_height(found: RingFit, head: HeadModel, target: RingTarget, camera: CameraGeometry,
-                  shares: Sequence[Shares], dots_px: NDArray) -> RingFit:
-    """A fit with a free wall height, the height improved by one step with all the blocks."""
-    problem = RingProblem(head, target, camera, shares, dots_px, free_height=True)
-    x = problem.start(found.panels, found.pose, found.tilts, found.softness)
-    x[-1] = found.height
+        for share, difference in zip(shares, thin.differences(x), strict=True)], dots_px)
     problem.learn_blur(x)
-    jacobian = problem.jacobian(x)
-    inverse = np.linalg.pinv(jacobian.T @ jacobian)
-    step = -inverse @ jacobian.T @ problem.residuals(x)
-    return replace(found, height=found.height + float(step[-1]),
-                   height_deviation=found.scatter * float(np.sqrt(inverse[-1, -1])))
+    return _summary(problem, *minimise(problem.equations, x, problem.size - 1))
 
 
-def _solve(problem: RingProblem, x: NDArray) -> OptimizeResult:
-    return least_squares(problem.residuals, x, problem.jacobian, method='lm', max_nfev=20,
-                         x_scale=10 * problem.scale, xtol=1e-8, ftol=1e-6)
+def free_height(fit: RingFit, head: HeadModel, target: RingTarget, camera: CameraGeometry,
+                shares: Sequence[Shares], dots_px: NDArray) -> RingFit:
+    """The same fit with a free height of the wall: a check of the scale of z.
+
+    :param fit: of all the other arguments. If the height hardly changes, only the height and its
+        deviation are new.
+    """
+    change = float(fit.equations.step()[-1])
+    if abs(change) < _CLOSE * target.height:
+        return replace(fit, height=fit.height + change, height_deviation=fit.scatter * float(
+            np.sqrt(fit.equations.covariance()[-1, -1])))
+    thin = RingProblem(head, target, camera, _thinned(shares), dots_px)
+    x = thin.start(fit.panels, fit.pose, fit.tilts, fit.softness)
+    thin.learn_blur(x)
+    x, equations = minimise(thin.equations, x)
+    found = _summary(thin, x, equations)
+    return replace(found, height_deviation=found.scatter * float(
+        np.sqrt(equations.covariance()[-1, -1])))
 
 
-def _summary(problem: RingProblem, x: NDArray, jacobian: NDArray) -> RingFit:
-    residuals = problem.differences(x)
-    normalised = np.concatenate([(r / share.noise).ravel()
-                                 for r, share in zip(residuals, problem.shares, strict=True)])
-    scatter = max(1.4826 * float(np.median(abs(normalised))), 1.0)
-    # a wall that is not there leaves its height undetermined
-    covariance = np.linalg.pinv(jacobian.T @ jacobian) * scatter**2
-    deviation = np.sqrt(np.diag(covariance))
+def _thinned(shares: Sequence[Shares]) -> list[Shares]:
+    return [share.thinned(_THIN) for share in shares]
+
+
+def _summary(problem: RingProblem, x: NDArray, equations: NormalEquations) -> RingFit:
+    """With the height of the wall as known."""
+    residuals, edge_px = [], []
     metres_per_pixel = problem.camera.camera_standoff / problem.camera.fx
-    edge_px, first = [], 0
-    for r, share in zip(residuals, problem.shares, strict=True):
-        last = first + r.size
-        moved_x, moved_y = (jacobian[first:last, 4 * PER_PANEL + k].reshape(r.shape) * share.noise
-                            for k in range(2))
-        steep = np.hypot(moved_x, moved_y)
+    for k, share in enumerate(problem.shares):
+        predicted, rates = problem.predicted_and_rates(x, k)
+        left = share.values - predicted
+        steep = np.hypot(*rates[4 * PER_PANEL:4 * PER_PANEL + 2])
         edges = steep > 0.3 * steep.max(axis=1, keepdims=True)
-        edge_px.append(np.sqrt(np.sum(r**2 * edges, axis=1) / np.sum(steep**2 * edges, axis=1))
+        edge_px.append(np.sqrt(np.sum(left**2 * edges, axis=1) / np.sum(steep**2 * edges, axis=1))
                        / metres_per_pixel)
-        first = last
-    panels = x[:4 * PER_PANEL].reshape(4, PER_PANEL).copy()
-    lengths = np.linalg.norm(jacobian, axis=0)
-    scaled = jacobian / np.maximum(lengths, 1e-300)
-    strengths = np.sqrt(np.linalg.eigvalsh(scaled.T @ scaled)[::-1].clip(min=1e-30))
-    return RingFit(panels, [problem.tilt(x, k) for k in range(len(residuals))], problem.pose(x),
-                   problem.height(x), float(deviation[-1]) if problem.free_height else 0.0,
-                   float(x[problem.softness]), residuals, edge_px, scatter,
-                   deviation[:4 * PER_PANEL].reshape(4, PER_PANEL),
-                   deviation[4 * PER_PANEL:problem.first_tilt],
-                   covariance[:problem.first_tilt, :problem.first_tilt],
-                   float(strengths[0] / strengths[-2]))
+        residuals.append(left)
+    normalised = np.concatenate([(left / share.noise).ravel()
+                                 for left, share in zip(residuals, problem.shares, strict=True)])
+    scatter = max(1.4826 * float(np.median(abs(normalised))), 1.0)
+    known = equations.first(problem.size - 1)
+    strengths = np.sqrt(np.linalg.eigvalsh(known.correlation())[::-1].clip(min=1e-30))
+    return RingFit(x[:4 * PER_PANEL].reshape(4, PER_PANEL).copy(),
+                   [problem.tilt(x, k) for k in range(len(residuals))], problem.pose(x),
+                   float(x[-1]), 0.0, float(x[problem.softness]), residuals, edge_px, scatter,
+                   known.covariance()[:problem.first_tilt, :problem.first_tilt] * scatter**2,
+                   float(strengths[0] / strengths[-2]), equations)
 
 
 def predicted_shares(head: HeadModel, target: RingTarget, camera: CameraGeometry,
@@ -159,16 +148,18 @@ def blocked_slits(fit: RingFit, head: HeadModel, target: RingTarget, camera: Cam
 
     The residuals are compared with the change that filling the slit would make.
     """
+    shares = _thinned(shares)
+    left = np.concatenate([r[:, ::_THIN].ravel() for r in fit.residuals])
+
     def predicted(target: RingTarget) -> list[NDArray]:
         problem = RingProblem(head, target, camera, shares, np.zeros((0, 2)))
         return problem.predicted(problem.start(fit.panels, fit.pose, fit.tilts))
 
-    open_shares, residual = predicted(target), np.concatenate([r.ravel() for r in fit.residuals])
-    azimuths, found = target.slits.azimuths, []
+    open_shares, azimuths, found = predicted(target), target.slits.azimuths, []
     for k in range(len(azimuths)):
         slits = target.slits.model_copy(update={'azimuths': azimuths[:k] + azimuths[k + 1:]})
         filled = predicted(target.model_copy(update={'slits': slits}))
         change = np.concatenate([(after - before).ravel()
                                  for after, before in zip(filled, open_shares, strict=True)])
-        found.append(residual @ change / (change @ change))
+        found.append(left @ change / (change @ change))
     return np.array(found)

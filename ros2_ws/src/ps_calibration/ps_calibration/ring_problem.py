@@ -1,6 +1,6 @@
 """What the pictures of a half ring should show, for all parameters of a fit, and how far they do.
 
-Residuals and their derivatives for ring_fit.py.
+Normal equations for ring_fit.py.
 """
 from collections.abc import Sequence
 from itertools import product
@@ -10,12 +10,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ps_calibration.gauss_newton import NormalEquations
 from ps_calibration.ring_target import RingTarget
 from ps_calibration.robust import soft
 from ps_calibration.shadow_model import light_and_rates, plate_irradiance
 from ps_calibration.shares import Shares
 from ps_calibration.target_pose import SIZE, TargetPose, dot_errors
-from ps_head_driver.camera_model import plane_points
+from ps_head_driver.camera_model import pixel_rays, plane_points, ray_points
 from ps_head_driver.head_model import DIRECTIONS, CameraGeometry, HeadModel
 from ps_head_driver.kinematics import PanelPose, PanelRing
 
@@ -25,12 +26,8 @@ PER_PANEL = 6
 # what is known of them beforehand: three times the tolerances of manufacture
 PANEL_PRIOR = np.array([0.009, 0.009, 0.009, 0.105, 0.105, 0.15])
 _TILT_PRIOR = 0.03                       # rad, error of the motor between two positions
-# typical sizes of the parameters
-PANEL_STEPS = np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-3])
-_POSE_STEPS = np.array([1e-5, 1e-5, 1e-5, 1e-3, 5e-4, 5e-4])
-_HEIGHT_STEP, _TILT_STEP, _SOFTNESS_STEP = 2e-5, 1e-3, 0.1
+STEP = 1e-6              # m or rad, of finite differences
 _SOFTNESS_PRIOR = 1.0    # a lens that blurs as much as the blocks do
-POINT_STEP = 1e-5                        # m
 _DOT_NOISE_PX = 0.003
 SOFT = 3.0               # standard deviations from which on a residual counts less
 
@@ -51,27 +48,24 @@ class RingProblem:
     """Residuals and their derivatives as functions of all parameters.
 
     Order: 4 x PER_PANEL, pose, error of the motor at the second position on, softness of the
-    pictures, then the wall's height if it is free. Softness is the variance of what blurs the
-    pictures (pixels, lens) relative to that of averaging over the blocks; left out, it would turn
-    all four panels.
+    pictures, height of the wall. Softness is the variance of what blurs the pictures (pixels,
+    lens) relative to that of averaging over the blocks; left out, it would turn all four panels.
     """
 
     def __init__(self, head: HeadModel, target: RingTarget, camera: CameraGeometry,
-                 shares: Sequence[Shares], dots_px: NDArray, free_height: bool = False) -> None:
+                 shares: Sequence[Shares], dots_px: NDArray) -> None:
         self.head, self.target, self.camera = head, target, camera
-        self.shares, self.dots_px, self.free_height = shares, dots_px, free_height
+        self.shares, self.dots_px = shares, dots_px
         self.first_tilt = 4 * PER_PANEL + SIZE
         self.softness = self.first_tilt + len(shares) - 1
-        self.size = self.softness + 1 + free_height
+        self.size = self.softness + 2
+        self.rays = [pixel_rays(camera, share.pixels) for share in shares]
         self.expected = np.zeros(self.size)
         self.expected[self.softness] = 1.0
         self.prior = np.full(self.size, np.inf)
         self.prior[:4 * PER_PANEL] = np.tile(PANEL_PRIOR, 4)
         self.prior[self.first_tilt:self.softness] = _TILT_PRIOR
         self.prior[self.softness] = _SOFTNESS_PRIOR
-        self.scale = np.concatenate([np.tile(PANEL_STEPS, 4), _POSE_STEPS,
-                                     np.full(len(shares) - 1, _TILT_STEP), [_SOFTNESS_STEP],
-                                     np.full(int(free_height), _HEIGHT_STEP)])
         #: what averaging over a block adds to the shares, per position (4, N) once it is known
         self.blurs: list[NDArray] = [np.zeros(share.values.shape) for share in shares]
 
@@ -83,7 +77,7 @@ class RingProblem:
         """
         errors = [tilt - share.tilt for tilt, share in zip(tilts, self.shares, strict=True)]
         return np.concatenate([panels.ravel(), pose.numbers, errors[1:], [softness],
-                               [self.target.height] * self.free_height])
+                               [self.target.height]])
 
     def pose(self, x: NDArray) -> TargetPose:
         """Pose of the target."""
@@ -94,15 +88,10 @@ class RingProblem:
         extra = x[self.first_tilt + position - 1] if position else 0.0
         return float(self.shares[position].tilt + extra)
 
-    def height(self, x: NDArray) -> float:
-        """Height of the wall, m."""
-        return float(x[-1]) if self.free_height else self.target.height
-
     def points(self, x: NDArray, position: int) -> NDArray:
         """Where the blocks are on the plate, (N, 2), target frame."""
         pose = self.pose(x)
-        there = plane_points(self.camera, self.shares[position].pixels, pose.plane)
-        return pose.to_target(there)[:, :2]
+        return pose.to_target(ray_points(self.camera, self.rays[position], pose.plane))[:, :2]
 
     def panels(self, x: NDArray, position: int) -> list[PanelPose]:
         """The four panels in the target frame."""
@@ -111,15 +100,12 @@ class RingProblem:
         ring = PanelRing(corrected(self.head, panels).bright_field)
         return [pose.panel_to_target(panel) for panel in ring.poses(self.tilt(x, position))]
 
-    def lights(self, x: NDArray) -> list[NDArray]:
-        """Irradiance per position, (4, N)."""
-        return [self._light(self.points(x, k), self.panels(x, k), self.height(x))
-                for k in range(len(self.shares))]
-
     def predicted(self, x: NDArray) -> list[NDArray]:
         """Shares per position, (4, N)."""
+        lights = [self._light(self.points(x, k), self.panels(x, k), x[-1])
+                  for k in range(len(self.shares))]
         return [light / light.sum(axis=0) + x[self.softness] * blur
-                for light, blur in zip(self.lights(x), self.blurs, strict=True)]
+                for light, blur in zip(lights, self.blurs, strict=True)]
 
     def differences(self, x: NDArray) -> list[NDArray]:
         """Measured minus predicted shares per position, (4, N)."""
@@ -136,7 +122,7 @@ class RingProblem:
 
     def _blur(self, x: NDArray, position: int) -> NDArray:
         """What averaging over a block adds to the share in its middle, (4, N)."""
-        share, panels, height = self.shares[position], self.panels(x, position), self.height(x)
+        share, panels, height = self.shares[position], self.panels(x, position), x[-1]
         light = self._light(self.points(x, position), panels, height)
         mean = np.zeros_like(light)
         # a share changes fast near the wall alone
@@ -149,69 +135,57 @@ class RingProblem:
             light[:, near] / light[:, near].sum(axis=0))
         return np.pad(change, ((0, 0), (0, light.shape[1] - share.near)))
 
-    def light_rates(self, x: NDArray, position: int) -> tuple[NDArray, NDArray]:
-        """Irradiance (4, N) and its derivatives by all parameters, (size, 4, N).
+    def predicted_and_rates(self, x: NDArray, position: int) -> tuple[NDArray, NDArray]:
+        """Shares (4, N) and their derivatives by all parameters, (size, 4, N).
 
-        All that moves a panel are shifts and turns of a rigid body, so two kinds of derivatives
-        suffice: by the panel's motion, and by the point's on the plate.
+        All that moves a panel are shifts and turns of a rigid body: the light's derivatives by
+        these, by the point on the plate and by the wall's height suffice.
         """
-        points, panels, height = self.points(x, position), self.panels(x, position), self.height(x)
-        lit = [light_and_rates(points, panel, height, self.target.footprint) for panel in panels]
-        gains = [panel.intensity for panel in panels]
-        light = np.stack([gain * part[0] for gain, part in zip(gains, lit, strict=True)])
-        by_motion = [gain * part[1] for gain, part in zip(gains, lit, strict=True)]
-        by_point = [(self._light(points + shift, panels, height) - light) / POINT_STEP
-                    for shift in POINT_STEP * np.eye(2)]
+        points, panels = self.points(x, position), self.panels(x, position)
+        pose = [*range(4 * PER_PANEL, self.first_tilt)]
+        common = [*pose, self.first_tilt + position - 1] if position else pose
+        steps = np.zeros((PER_PANEL - 1 + len(common), self.size))
+        for k in range(PER_PANEL - 1):
+            steps[k, k:4 * PER_PANEL:PER_PANEL] = STEP      # of all four panels, each its own
+        steps[PER_PANEL - 1:, common] = STEP * np.eye(len(common))
+        moved = [self.panels(x + step, position) for step in steps]
+        shifts = [(self.points(x + step, position) - points).T / STEP
+                  for step in STEP * np.eye(self.size)[pose]]
+        light = np.empty((4, len(points)))
         rates = np.zeros((self.size, *light.shape))
-        for k in range(self.size):
-            moved, step = x.copy(), self.scale[k] * 0.1
-            moved[k] += step
-            if self.free_height and k == self.size - 1:
-                rates[k] = (self._light(points, panels, height + step) - light) / step
-            elif k < 4 * PER_PANEL and k % PER_PANEL == PER_PANEL - 1:
-                rates[k, k // PER_PANEL] = light[k // PER_PANEL]
-            elif k < self.first_tilt or (
-                    position and k == self.first_tilt + position - 1):
-                own = (range(4) if k >= 4 * PER_PANEL else [k // PER_PANEL])
-                after = self.panels(moved, position)
-                for i in own:
-                    rates[k, i] = by_motion[i] @ rigid_motion(panels[i], after[i]) / step
-            if 4 * PER_PANEL <= k < self.first_tilt:
-                shift = (self.points(moved, position) - points) / step
-                rates[k] += by_point[0] * shift[:, 0] + by_point[1] * shift[:, 1]
-        return light, rates
-
-    def share_rates(self, x: NDArray, position: int) -> NDArray:
-        """Derivatives of the predicted shares by all parameters, (size, 4, N)."""
-        light, rates = self.light_rates(x, position)
+        for i, panel in enumerate(panels):
+            own, by = light_and_rates(points, panel, x[-1], self.target.footprint)
+            light[i], by = panel.intensity * own, panel.intensity * by.T
+            motions = np.stack([rigid_motion(panel, after[i]) for after in moved]) / STEP
+            last = (i + 1) * PER_PANEL - 1
+            rates[[*range(i * PER_PANEL, last), *common], i] = motions @ by[:6]
+            rates[last, i] = light[i]
+            for k, shift in zip(pose, shifts, strict=True):
+                rates[k, i] += by[6] * shift[0] + by[7] * shift[1]
+            rates[-1, i] = by[8]
         total = light.sum(axis=0)
-        rates = (rates - light / total * rates.sum(axis=1, keepdims=True)) / total
+        shares = light / total
+        rates -= shares * rates.sum(axis=1, keepdims=True)
+        rates /= total
         rates[self.softness] = self.blurs[position]
-        return rates
+        return shares + x[self.softness] * self.blurs[position], rates
 
-    def residuals(self, x: NDArray) -> NDArray:
-        """Normalised by the noise expected; specks in the pictures count less."""
-        parts = [soft(-difference / (share.noise * SOFT))[0]
-                 for difference, share in zip(self.differences(x), self.shares, strict=True)]
-        dots = dot_errors(self.pose(x).numbers, self.dots_px, self.target, self.camera)
-        return np.concatenate([*(SOFT * part.ravel() for part in parts), dots / _DOT_NOISE_PX,
-                               (x - self.expected) / self.prior])
-
-    def jacobian(self, x: NDArray) -> NDArray:
-        """Derivatives of the residuals, (M, size)."""
-        parts = []
-        for k, (difference, share) in enumerate(
-                zip(self.differences(x), self.shares, strict=True)):
-            slope = soft(difference / (share.noise * SOFT))[1]
-            parts.append((self.share_rates(x, k) * (slope / share.noise)).reshape(self.size, -1))
-        dots = np.zeros((self.size, self.dots_px.size))
+    def equations(self, x: NDArray) -> NormalEquations:
+        """Of all residuals, relative to the noise expected; specks in the pictures count less."""
         numbers = self.pose(x).numbers
-        here = dot_errors(numbers, self.dots_px, self.target, self.camera)
-        for k, step in enumerate(0.1 * _POSE_STEPS):
-            there = dot_errors(numbers + step * np.eye(SIZE)[k], self.dots_px, self.target,
-                               self.camera)
-            dots[4 * PER_PANEL + k] = (there - here) / (step * _DOT_NOISE_PX)
-        return np.concatenate([*parts, dots, np.diag(1 / self.prior)], axis=1).T
+        dots = dot_errors(numbers, self.dots_px, self.target, self.camera)
+        by_pose = np.zeros((self.size, dots.size))
+        by_pose[4 * PER_PANEL:self.first_tilt] = [
+            (dot_errors(numbers + step, self.dots_px, self.target, self.camera) - dots) / STEP
+            for step in STEP * np.eye(SIZE)]
+        sums = NormalEquations.of(dots / _DOT_NOISE_PX, by_pose / _DOT_NOISE_PX)
+        sums += NormalEquations.of((x - self.expected) / self.prior, np.diag(1 / self.prior))
+        for position, share in enumerate(self.shares):
+            predicted, rates = self.predicted_and_rates(x, position)
+            left, slope = soft((predicted - share.values) / (share.noise * SOFT))
+            rates *= slope / share.noise
+            sums += NormalEquations.of(SOFT * left, rates)
+        return sums
 
 
 def rigid_motion(before: PanelPose, after: PanelPose) -> NDArray:

@@ -24,6 +24,7 @@ _FAST: dict[str, Any] = {'cache': True, 'fastmath': True, 'error_model': 'numpy'
 _PARTS = 8                         # the panel's width is divided into, at least
 _LOCK = threading.Lock()           # numba's plain threading layer allows one caller at a time
 _NEVER = 1.0                       # m; farther than any shadow reaches
+RATES = 9                          # derivatives, see light_and_rates
 
 
 @nb.njit(inline='always', **_FAST)
@@ -40,24 +41,27 @@ def _in_wall(x, y, f):  # type: ignore[no-untyped-def]
 
 @nb.njit(**_FAST)
 def first_wall(x, y, ux, uy, limit, f):  # type: ignore[no-untyped-def]
-    """Way from a free point along a horizontal unit vector to the wall, m; _NEVER beyond limit."""
+    """Way from a free point along a horizontal unit vector to the wall, m; _NEVER beyond limit.
+
+    :returns: way, and x and y of a normal, of any length, of the face that is met.
+    """
     along, square = x * ux + y * uy, x * x + y * y
     outer = along * along - square + f[0, 1] * f[0, 1]
     if outer <= 0.0:
-        return _NEVER
+        return _NEVER, 0.0, 0.0
     outer = math.sqrt(outer)
     if -along + outer <= 0.0 or -along - outer >= limit:
-        return _NEVER
-    best = limit
+        return _NEVER, 0.0, 0.0
+    best, nx, ny = limit, 0.0, 0.0
     # through the circles
     inner = along * along - square + f[0, 0] * f[0, 0]
     t = -along - outer
     if 0.0 <= t < best and _in_wall(x + t * ux, y + t * uy, f):
-        best = t
+        best, nx, ny = t, x + t * ux, y + t * uy
     if inner > 0.0:
         t = -along + math.sqrt(inner)
         if 0.0 <= t < best and _in_wall(x + t * ux, y + t * uy, f):
-            best = t
+            best, nx, ny = t, x + t * ux, y + t * uy
     # through the plane faces at the ends and in the slits
     for k in range(4, 2 * f.shape[0]):
         ax, ay = f[k // 2, 0], f[k // 2, 1]
@@ -72,15 +76,15 @@ def first_wall(x, y, ux, uy, limit, f):  # type: ignore[no-untyped-def]
         radius = px * px + py * py
         if (px * ax + py * ay > 0.0 and f[0, 0] * f[0, 0] <= radius <= f[0, 1] * f[0, 1]
                 and _in_wall(px, py, f)):
-            best = t
-    return best if best < limit else _NEVER
+            best, nx, ny = t, -ay, ax
+    return best if best < limit else _NEVER, nx, ny
 
 
 @nb.njit(inline='always', **_FAST)
 def _panel(x, y, centre, axis, right, up, size, lobe, rates):  # type: ignore[no-untyped-def]
     """Irradiance under the whole panel, by quadrature exact to 1e-6.
 
-    :param rates: (6,) or (0,): its derivatives are added to it, see light_and_rates.
+    :param rates: (RATES,) or (0,): its derivatives by the panel's motion are added to it.
     """
     total = 0.0
     for j in range(3):
@@ -136,11 +140,11 @@ def _column(t, forward, side, edges):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(inline='always', **_FAST)
-def _crown(t, x, y, forward, side, height, limit, f):  # type: ignore[no-untyped-def]
-    """Tangent of the elevation up to which the wall stands in the direction forward + t side."""
+def _wall(t, x, y, forward, side, limit, f):  # type: ignore[no-untyped-def]
+    """The same as first_wall in the direction forward + t side."""
     length = math.sqrt(1.0 + t * t)
-    return height / first_wall(x, y, (forward[0] + t * side[0]) / length,
-                               (forward[1] + t * side[1]) / length, limit, f)
+    return first_wall(x, y, (forward[0] + t * side[0]) / length,
+                      (forward[1] + t * side[1]) / length, limit, f)
 
 
 @nb.njit(inline='always', **_FAST)
@@ -154,10 +158,12 @@ def _density(tangent, facing, axis, lobe):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(inline='always', **_FAST)
-def _strip(low, high, below, above, t, weight, forward, side, edges, turns, axis, lobe, rates):  # type: ignore[no-untyped-def]
+def _strip(low, high, below, above, wall, t, weight, forward, side, edges, turns, axis, lobe,  # type: ignore[no-untyped-def]
+           rates):
     """Irradiance from between two elevations, times weight; its derivatives are taken off rates.
 
-    :param below, above: edges of the panel that the ends are on, -1: they do not move.
+    :param below, above: edges of the panel that the ends are on; -1: the horizon, and the wall.
+    :param wall: as from first_wall.
     :param turns: (4, 6, 3) derivatives of edges.
     """
     length = math.sqrt(1.0 + t * t)
@@ -170,6 +176,13 @@ def _strip(low, high, below, above, t, weight, forward, side, edges, turns, axis
                 for i in range(6):
                     rates[i] -= gain * (turns[edge, i, 0] * x + turns[edge, i, 1] * y
                                         + turns[edge, i, 2] * end)
+        if above < 0:
+            way, nx, ny = wall
+            gain = weight * _density(high, facing, axis, lobe) / way
+            rates[8] -= gain
+            gain *= high / (nx * x + ny * y)
+            rates[6] -= gain * nx
+            rates[7] -= gain * ny
     if lobe == 1.0:
         return 0.5 * weight * (high * high / (1.0 + high * high) - low * low / (1.0 + low * low))
     total = 0.0
@@ -186,9 +199,10 @@ def _strip(low, high, below, above, t, weight, forward, side, edges, turns, axis
 
 
 @nb.njit(**_FAST)
-def _wall_edges(x, y, forward, side, first, last, limit, f, out):  # type: ignore[no-untyped-def]
+def _wall_edges(x, y, forward, side, first, last, limit, f, out, ways):  # type: ignore[no-untyped-def]
     """Write to out the directions, between two, of the wall's vertical edges and its outline.
 
+    :param ways: filled in with their distances, m.
     :returns: their number.
     """
     n = 0
@@ -204,7 +218,7 @@ def _wall_edges(x, y, forward, side, first, last, limit, f, out):  # type: ignor
                 ahead = dx * forward[0] + dy * forward[1]
                 if ahead <= 0.0 or dx * dx + dy * dy > limit * limit:
                     continue
-                out[n] = (dx * side[0] + dy * side[1]) / ahead
+                out[n], ways[n] = (dx * side[0] + dy * side[1]) / ahead, math.hypot(dx, dy)
                 n += first < out[n] < last
     square = x * x + y * y - f[0, 1] * f[0, 1]
     if 0.0 < square < limit * limit:
@@ -214,7 +228,7 @@ def _wall_edges(x, y, forward, side, first, last, limit, f, out):  # type: ignor
             dy = -y * tangent - sign * x * f[0, 1]
             ahead = dx * forward[0] + dy * forward[1]
             if ahead > 0.0:
-                out[n] = (dx * side[0] + dy * side[1]) / ahead
+                out[n], ways[n] = (dx * side[0] + dy * side[1]) / ahead, tangent
                 n += first < out[n] < last
     return n
 
@@ -225,7 +239,7 @@ def _crossing(a, b, over_a, over_b, low_edge, x, y, forward, side, edges, height
     for _ in range(4):
         t = (a * over_b - b * over_a) / (over_b - over_a)
         low, high, _, _ = _column(t, forward, side, edges)
-        over = _crown(t, x, y, forward, side, height, limit, f) - (low if low_edge else high)
+        over = height / _wall(t, x, y, forward, side, limit, f)[0] - (low if low_edge else high)
         if (over > 0.0) == (over_b > 0.0):
             b, over_b, over_a = t, over, 0.5 * over_a
         else:
@@ -241,8 +255,8 @@ def _hidden_part(begin, end, x, y, forward, side, edges, turns, axis, lobe, heig
     begin, end = begin + inset, end - inset
     low_a, high_a, _, _ = _column(begin, forward, side, edges)
     low_b, high_b, _, _ = _column(end, forward, side, edges)
-    crown_a = _crown(begin, x, y, forward, side, height, limit, f)
-    crown_b = _crown(end, x, y, forward, side, height, limit, f)
+    crown_a = height / _wall(begin, x, y, forward, side, limit, f)[0]
+    crown_b = height / _wall(end, x, y, forward, side, limit, f)[0]
     if crown_a <= low_a and crown_b <= low_b:
         return 0.0
     a, b = begin, end
@@ -259,14 +273,35 @@ def _hidden_part(begin, end, x, y, forward, side, edges, turns, axis, lobe, heig
         for k in range(4 if stop - start > 1e-12 else 0):
             t = 0.5 * (start + stop) + 0.5 * (stop - start) * _NODES_4[k]
             low, high, below, above = _column(t, forward, side, edges)
-            crown = _crown(t, x, y, forward, side, height, limit, f)
-            if crown < high:
-                high, above = crown, -1
+            wall = _wall(t, x, y, forward, side, limit, f)
+            if height / wall[0] < high:
+                high, above = height / wall[0], -1
             if high > low:
-                total += _strip(low, high, below, above, t,
+                total += _strip(low, high, below, above, wall, t,
                                 0.5 * (stop - start) * _WEIGHTS_4[k] / (1.0 + t * t), forward,
                                 side, edges, turns, axis, lobe, rates)
     return total
+
+
+@nb.njit(**_FAST)
+def _sweep(t, way, gap, x, y, forward, side, edges, turns, axis, lobe, height, limit, f, rates):  # type: ignore[no-untyped-def]
+    """Take off rates what an edge of the wall hides as it moves sideways when the point moves.
+
+    :param t, way: direction and distance of the edge.
+    :param gap: in t, to look past it on either side.
+    """
+    jump = 0.0
+    for sign in (-1.0, 1.0):
+        beside = t + sign * gap
+        low, high, _, _ = _column(beside, forward, side, edges)
+        wall = _wall(beside, x, y, forward, side, limit, f)
+        high = min(high, height / wall[0])
+        if high > low:
+            jump -= sign * _strip(low, high, -1, -1, wall, beside, 1.0, forward, side, edges,
+                                  turns, axis, lobe, rates[:0])
+    gain = jump / (way * math.sqrt(1.0 + t * t))
+    rates[6] -= gain * (forward[1] + t * side[1])
+    rates[7] += gain * (forward[0] + t * side[0])
 
 
 @nb.njit(inline='always', **_FAST)
@@ -336,11 +371,15 @@ def _hidden(x, y, centre, axis, right, up, size, lobe, height, whole, rates):  #
         return 0.0
     f = np.empty(whole.shape)
     f = f[:_within(x, y, limit, whole, f)]
-    n = 4 + _wall_edges(x, y, forward, side, first, last, limit, f, breaks[4:])
-    breaks[:n].sort()
+    ways = np.empty(breaks.shape)
+    n = 4 + _wall_edges(x, y, forward, side, first, last, limit, f, breaks[4:], ways[4:])
     edges, turns = np.empty((4, 3)), np.empty((4 if rates.size else 0, 6, 3))
     _outlines(q, axis[0] * q[0] + axis[1] * q[1] + axis[2] * q[2], axis, right, up, size, edges,
               turns, rates.size > 0)
+    for k in range(4, n if rates.size else 0):
+        _sweep(breaks[k], ways[k], 1e-6 * (last - first), x, y, forward, side, edges, turns, axis,
+               lobe, height, limit, f, rates)
+    breaks[:n].sort()
     total = 0.0
     for k in range(n - 1):
         gap = breaks[k + 1] - breaks[k]
@@ -354,13 +393,17 @@ def _hidden(x, y, centre, axis, right, up, size, lobe, height, whole, rates):  #
 
 @nb.njit(parallel=True, **_FAST)
 def _irradiance(points, centre, axis, right, up, size, lobe, height, f, with_rates):  # type: ignore[no-untyped-def]
-    out = np.zeros((points.shape[0], 7 if with_rates else 1))
+    out = np.zeros((points.shape[0], 1 + RATES if with_rates else 1))
     for k in nb.prange(points.shape[0]):
         x, y = points[k, 0], points[k, 1]
         rates = out[k, 1:]
         out[k, 0] = _panel(x, y, centre, axis, right, up, size, lobe, rates)
         if height > 0.0 and out[k, 0] > 0.0:
             out[k, 0] -= _hidden(x, y, centre, axis, right, up, size, lobe, height, f, rates)
+        if with_rates:
+            # panel, wall and point moved together change nothing
+            rates[6] -= rates[0]
+            rates[7] -= rates[1]
     return out
 
 
@@ -380,10 +423,11 @@ def plate_irradiance(points: NDArray, panel: PanelPose, height: float,
 
 def light_and_rates(points: NDArray, panel: PanelPose, height: float,
                     footprint: NDArray) -> tuple[NDArray, NDArray]:
-    """The same with its derivatives by the panel's motion.
+    """The same with its derivatives.
 
-    :returns: (N,), and (N, 6): by a shift of the panel (per m) and by a turn about its centre
-        (per rad), x y z of the target frame.
+    :returns: (N,), and (N, RATES): by a shift of the panel (per m) and by a turn about its centre
+        (per rad), x y z of the target frame each; by a shift of the point along x and y (per m);
+        by the wall's height (per m).
     """
     out = _run(points, panel, height, footprint, True)
     return out[:, 0], out[:, 1:]

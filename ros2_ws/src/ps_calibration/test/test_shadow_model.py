@@ -68,18 +68,21 @@ def test_derivatives_are_those_of_the_light(
     panel = replace(panel, lobe_exponent=lobe, axis=tilted.apply(panel.axis),
                     right=tilted.apply(panel.right))
 
-    def light(moved: PanelPose) -> np.ndarray:
-        return plate_irradiance(points, moved, target.height, target.footprint)
+    def light(moved: PanelPose, shift: np.ndarray | float = 0.0, rise: float = 0.0) -> np.ndarray:
+        return plate_irradiance(points + shift, moved, target.height + rise, target.footprint)
 
     found, rates = light_and_rates(points, panel, target.height, target.footprint)
     assert found == pytest.approx(light(panel), rel=1e-12)
-    for k in range(6):
-        step = (1e-5 if k < 3 else 1e-4) * np.eye(3)[k % 3]
+    for k in range(9):
+        step = (1e-4 if 3 <= k < 6 else 1e-5 if k < 3 else 1e-7) * np.eye(3)[k % 3]
         ends = []
         for way in (step, -step):
             turn = Rotation.from_rotvec(way)
-            ends.append(light(replace(panel, center=panel.center + way) if k < 3 else replace(
-                panel, axis=turn.apply(panel.axis), right=turn.apply(panel.right))))
+            ends.append(
+                light(replace(panel, center=panel.center + way)) if k < 3
+                else light(replace(panel, axis=turn.apply(panel.axis),
+                                   right=turn.apply(panel.right))) if k < 6
+                else light(panel, shift=way[:2]) if k < 8 else light(panel, rise=way[2]))
         expected = (ends[0] - ends[1]) / (2 * step.sum())
         # a few points where the quadrature changes its parts may be off
         error = np.abs(rates[:, k] - expected) / np.abs(expected).max()

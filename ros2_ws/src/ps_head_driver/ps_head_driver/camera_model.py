@@ -79,7 +79,13 @@ def plane_points(camera: CameraGeometry, pixels: ArrayLike, plane: Plane,
         broadcasts.
     :returns: (..., 3) float64, ps_head_plane, m.
     """
-    rays, center = pixel_rays(camera, pixels), camera_center(camera)
+    return ray_points(camera, pixel_rays(camera, pixels), plane, height)
+
+
+def ray_points(camera: CameraGeometry, rays: NDArray, plane: Plane,
+               height: ArrayLike = 0.0) -> NDArray:
+    """The same as plane_points from rays (..., 3), as from pixel_rays: to find these only once."""
+    center = camera_center(camera)
     normal = np.asarray(plane.normal, np.float64)
     # the surface is the plane lifted along z by the height: normal . x = offset + normal_z height
     level = plane.offset + normal[2] * np.asarray(height, np.float64)

@@ -25,6 +25,7 @@ from ps_calibration.ring_pictures import (
     locate,
     nominal_tilt,
     require_labels,
+    require_linear,
 )
 from ps_calibration.ring_target import RingTarget
 from ps_calibration.shares import Shares, measure_shares
@@ -99,6 +100,8 @@ def calibrate(stacks: Sequence[Stack], target: RingTarget, head: HeadModel) -> C
     try:
         captures = [light_only(stack) for stack in stacks]
         dots_px, pose = locate(captures, target, camera)
+        for stack, capture in zip(stacks, captures, strict=True):
+            require_linear(capture, stack.stack_id)
         clock['detect'] = time.perf_counter()
         kinematics = BrightFieldKinematics(head)
         shares = [measure_shares(capture[:4], nominal_tilt(stack, kinematics), pose, target,

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from ps_calibration.detection import find_dots
+from ps_calibration.linearity import response_exponent
 from ps_calibration.ring_target import RingTarget
 from ps_calibration.shares import Shares
 from ps_calibration.target_pose import TargetPose, fit_pose
@@ -21,6 +22,7 @@ _BLOCKS = 16             # a side, that tell how bright the plate is around a sa
 _GLINT = 0.8             # of a saturated pixel's value: a plate darker than this is not too bright
 _DARK = 0.05             # mean of a picture, relative to the end of its range
 _DEAD = 0.3              # of the mean of the four panels
+_NOT_LINEAR = 0.01       # off the camera's exponent of 1; turns panels by less than 0.1 degrees
 MOVED_PX = 0.3           # of a dot, between two pictures
 _TILE_PX = 64            # in which a dark picture's noise and mean are alike
 _NO_ROUNDING = 0.7       # grey values; with more noise, rounding leaves means alone
@@ -172,8 +174,22 @@ def light_only(stack: Stack) -> list[NDArray]:
                                 'taken without it; check its cable and LEDs')
     if abs(together.mean() / means.sum() - 1) > 0.05:
         raise PsError(code, f'{name}: the picture with all panels on is not the sum of the '
-                            'single ones; check exposure_scale and the panels')
+                            'single ones; check exposure_scale and the panels, and that the '
+                            'camera has no gamma and no automatic gain')
     return [*singles, together]
+
+
+def require_linear(capture: Sequence[NDArray], name: str) -> None:
+    """Refuse pictures of a camera whose grey values are not proportional to light.
+
+    :param capture: as from light_only, of a target that was found.
+    """
+    exponent, deviation = response_exponent(capture[:4], capture[4])
+    if abs(exponent - 1) > _NOT_LINEAR + 4 * deviation:
+        raise PsError(ErrorCode.CALIBRATION_CAPTURE_FAILED,
+                      f'{name or "pictures"}: grey values are not proportional to light, but to '
+                      f'its power {exponent:.2f}; switch off gamma, contrast and automatic gain '
+                      'of the camera')
 
 
 def locate(captures: Sequence[Sequence[NDArray]], target: RingTarget,

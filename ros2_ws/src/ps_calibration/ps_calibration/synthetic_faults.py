@@ -81,6 +81,10 @@ def _brighter(factor: float) -> Callable[[NDArray], NDArray]:
     return lambda image: np.clip(image * factor, 0, 255).astype(np.uint8)
 
 
+def _gamma(exponent: float) -> Callable[[NDArray], NDArray]:
+    return lambda image: np.rint(255 * (image / 255) ** exponent).astype(np.uint8)
+
+
 def _lamp(image: NDArray) -> NDArray:
     return np.clip(image.astype(int) + 40, 0, 255).astype(np.uint8)
 
@@ -132,6 +136,11 @@ FAULTS = (
     Fault('frame E saturated', lambda r: r.changed(E=_brighter(3)), ('frame E is saturated',)),
     Fault('all frames dark', lambda r: with_images(
         r.good, [image // 20 for image in r.good.images]), ('too dark',)),
+    Fault('camera with gamma', lambda r: with_images(r.good, [
+        _gamma(0.45)(image) for image in r.good.images]),
+          ('no gamma', 'not proportional to light')),
+    Fault('camera not quite linear', lambda r: with_images(r.good, [
+        _gamma(0.96)(image) for image in r.good.images]), ('not proportional to light',)),
     Fault('a lamp switched on in frame S', lambda r: r.changed(S=_lamp), ('not the sum',)),
     Fault('frame S moved by 2 px', lambda r: r.changed(S=_shifted(2.0)), ('frame S', )),
     Fault('frame W moved by 0.5 px', lambda r: r.changed(W=_shifted(0.5)), ('frame W',)),

@@ -36,6 +36,8 @@ class RingFit:
     :param height: of the wall, m: as given, or fitted, see free_height.
     :param height_deviation: its standard deviation, 0 if it was given.
     :param softness: of the pictures: variance of their blur over that of the blocks.
+    :param glow: light that the wall throws onto the plate, over what its reflectance in the
+        target file says.
     :param residuals: per position (4, N) measured minus predicted share.
     :param edge_px: per position (4,) what the residuals amount to as a shift of the shadow edges.
     :param scatter: of the residuals relative to the noise expected, robust, at least 1.
@@ -52,6 +54,7 @@ class RingFit:
     height: float
     height_deviation: float
     softness: float
+    glow: float
     residuals: list[NDArray]
     edge_px: list[NDArray]
     scatter: float
@@ -78,12 +81,14 @@ def fit_ring(head: HeadModel, target: RingTarget, camera: CameraGeometry,
     """
     thin = RingProblem(head, target, camera, _thinned(shares), dots_px)
     x = thin.start(np.zeros((4, PER_PANEL)), pose, [share.tilt for share in shares])
+    thin.learn_glow(x)
     x, _ = minimise(thin.equations, x, thin.size - 1)
     # what remains tells how far to trust the shadows and the rest
     problem = RingProblem(head, target, camera, [
         share.reweighed(difference)
         for share, difference in zip(shares, thin.differences(x), strict=True)], dots_px)
     problem.learn_blur(x)
+    problem.learn_glow(x)
     return _summary(problem, *minimise(problem.equations, x, problem.size - 1))
 
 
@@ -99,8 +104,9 @@ def free_height(fit: RingFit, head: HeadModel, target: RingTarget, camera: Camer
         return replace(fit, height=fit.height + change, height_deviation=fit.scatter * float(
             np.sqrt(fit.equations.covariance()[-1, -1])))
     thin = RingProblem(head, target, camera, _thinned(shares), dots_px)
-    x = thin.start(fit.panels, fit.pose, fit.tilts, fit.softness)
+    x = thin.start(fit.panels, fit.pose, fit.tilts, fit.softness, fit.glow)
     thin.learn_blur(x)
+    thin.learn_glow(x)
     x, equations = minimise(thin.equations, x)
     found = _summary(thin, x, equations)
     return replace(found, height_deviation=found.scatter * float(
@@ -130,7 +136,8 @@ def _summary(problem: RingProblem, x: NDArray, equations: NormalEquations) -> Ri
     strengths = np.sqrt(np.linalg.eigvalsh(known.correlation())[::-1].clip(min=1e-30))
     return RingFit(x[:4 * PER_PANEL].reshape(4, PER_PANEL).copy(),
                    [problem.tilt(x, k) for k in range(len(residuals))], problem.pose(x),
-                   float(x[-1]), 0.0, float(x[problem.softness]), residuals, edge_px, scatter,
+                   float(x[-1]), 0.0, float(x[problem.softness]), float(x[problem.glow]),
+                   residuals, edge_px, scatter,
                    known.covariance()[:problem.first_tilt, :problem.first_tilt] * scatter**2,
                    float(strengths[0] / strengths[-2]), equations)
 

@@ -16,6 +16,7 @@ from ps_calibration.robust import soft
 from ps_calibration.shadow_model import light_and_rates, plate_irradiance
 from ps_calibration.shares import Shares
 from ps_calibration.target_pose import SIZE, TargetPose, dot_errors
+from ps_calibration.wall_glow import wall_glow
 from ps_head_driver.camera_model import pixel_rays, plane_points, ray_points
 from ps_head_driver.head_model import DIRECTIONS, CameraGeometry, HeadModel
 from ps_head_driver.kinematics import PanelPose, PanelRing
@@ -28,6 +29,7 @@ PANEL_PRIOR = np.array([0.009, 0.009, 0.009, 0.105, 0.105, 0.15])
 _TILT_PRIOR = 0.03                       # rad, error of the motor between two positions
 STEP = 1e-6              # m or rad, of finite differences
 _SOFTNESS_PRIOR = 1.0    # a lens that blurs as much as the blocks do
+_GLOW_PRIOR = 1.0        # a wall that is black, or twice as bright as the file says
 _DOT_NOISE_PX = 0.003
 SOFT = 3.0               # standard deviations from which on a residual counts less
 
@@ -48,8 +50,11 @@ class RingProblem:
     """Residuals and their derivatives as functions of all parameters.
 
     Order: 4 x PER_PANEL, pose, error of the motor at the second position on, softness of the
-    pictures, height of the wall. Softness is the variance of what blurs the pictures (pixels,
-    lens) relative to that of averaging over the blocks; left out, it would turn all four panels.
+    pictures, glow and height of the wall. Softness is the variance of what blurs the pictures
+    (pixels, lens) relative to that of averaging over the blocks; left out, it would turn all four
+    panels.
+    Glow is the light that the wall throws onto the plate relative to what its reflectance in the
+    target file says.
     """
 
     def __init__(self, head: HeadModel, target: RingTarget, camera: CameraGeometry,
@@ -58,26 +63,29 @@ class RingProblem:
         self.shares, self.dots_px = shares, dots_px
         self.first_tilt = 4 * PER_PANEL + SIZE
         self.softness = self.first_tilt + len(shares) - 1
-        self.size = self.softness + 2
+        self.glow = self.softness + 1
+        self.size = self.glow + 2
         self.rays = [pixel_rays(camera, share.pixels) for share in shares]
         self.expected = np.zeros(self.size)
-        self.expected[self.softness] = 1.0
+        self.expected[self.softness] = self.expected[self.glow] = 1.0
         self.prior = np.full(self.size, np.inf)
         self.prior[:4 * PER_PANEL] = np.tile(PANEL_PRIOR, 4)
         self.prior[self.first_tilt:self.softness] = _TILT_PRIOR
-        self.prior[self.softness] = _SOFTNESS_PRIOR
+        self.prior[self.softness], self.prior[self.glow] = _SOFTNESS_PRIOR, _GLOW_PRIOR
         #: what averaging over a block adds to the shares, per position (4, N) once it is known
         self.blurs: list[NDArray] = [np.zeros(share.values.shape) for share in shares]
+        #: the same of the light that the wall throws onto the plate
+        self.glows: list[NDArray] = [np.zeros(share.values.shape) for share in shares]
 
     def start(self, panels: NDArray, pose: TargetPose, tilts: Sequence[float],
-              softness: float = 1.0) -> NDArray:
+              softness: float = 1.0, glow: float = 1.0) -> NDArray:
         """All parameters, the wall as high as the target file says.
 
         :param tilts: per position, rad; the first is taken to be nominal.
         """
         errors = [tilt - share.tilt for tilt, share in zip(tilts, self.shares, strict=True)]
-        return np.concatenate([panels.ravel(), pose.numbers, errors[1:], [softness],
-                               [self.target.height]])
+        return np.concatenate([panels.ravel(), pose.numbers, errors[1:],
+                               [softness, glow, self.target.height]])
 
     def pose(self, x: NDArray) -> TargetPose:
         """Pose of the target."""
@@ -104,8 +112,8 @@ class RingProblem:
         """Shares per position, (4, N)."""
         lights = [self._light(self.points(x, k), self.panels(x, k), x[-1])
                   for k in range(len(self.shares))]
-        return [light / light.sum(axis=0) + x[self.softness] * blur
-                for light, blur in zip(lights, self.blurs, strict=True)]
+        return [light / light.sum(axis=0) + x[self.softness] * blur + x[self.glow] * glow
+                for light, blur, glow in zip(lights, self.blurs, self.glows, strict=True)]
 
     def differences(self, x: NDArray) -> list[NDArray]:
         """Measured minus predicted shares per position, (4, N)."""
@@ -115,6 +123,10 @@ class RingProblem:
     def learn_blur(self, x: NDArray) -> None:
         """From now on, predict what averaging over the blocks does near these parameters."""
         self.blurs = [self._blur(x, k) for k in range(len(self.shares))]
+
+    def learn_glow(self, x: NDArray) -> None:
+        """From now on, predict what light by way of the wall does near these parameters."""
+        self.glows = [self._glow(x, k) for k in range(len(self.shares))]
 
     def _light(self, points: NDArray, panels: Sequence[PanelPose], height: float) -> NDArray:
         return np.stack([panel.intensity * plate_irradiance(
@@ -134,6 +146,14 @@ class RingProblem:
         change = mean[:, near] / mean[:, near].sum(axis=0) - (
             light[:, near] / light[:, near].sum(axis=0))
         return np.pad(change, ((0, 0), (0, light.shape[1] - share.near)))
+
+    def _glow(self, x: NDArray, position: int) -> NDArray:
+        """What the wall's light adds to the shares, (4, N)."""
+        points, panels = self.points(x, position), self.panels(x, position)
+        light = self._light(points, panels, x[-1])
+        whole = light + np.stack([panel.intensity * wall_glow(points, panel, self.target)
+                                  for panel in panels])
+        return np.asarray(whole / whole.sum(axis=0) - light / light.sum(axis=0))
 
     def predicted_and_rates(self, x: NDArray, position: int) -> tuple[NDArray, NDArray]:
         """Shares (4, N) and their derivatives by all parameters, (size, 4, N).
@@ -167,8 +187,9 @@ class RingProblem:
         shares = light / total
         rates -= shares * rates.sum(axis=1, keepdims=True)
         rates /= total
-        rates[self.softness] = self.blurs[position]
-        return shares + x[self.softness] * self.blurs[position], rates
+        rates[self.softness], rates[self.glow] = self.blurs[position], self.glows[position]
+        return (shares + x[self.softness] * self.blurs[position]
+                + x[self.glow] * self.glows[position], rates)
 
     def equations(self, x: NDArray) -> NormalEquations:
         """Of all residuals, relative to the noise expected; specks in the pictures count less."""

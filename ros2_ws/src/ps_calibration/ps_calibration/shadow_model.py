@@ -22,7 +22,7 @@ _NODES_3, _WEIGHTS_3 = np.polynomial.legendre.leggauss(3)
 # no division by zero happens, so none need be looked for
 _FAST: dict[str, Any] = {'cache': True, 'fastmath': True, 'error_model': 'numpy'}
 _PARTS = 8                         # the panel's width is divided into, at least
-_LOCK = threading.Lock()           # numba's plain threading layer allows one caller at a time
+THREADS = threading.Lock()         # numba's plain threading layer allows one caller at a time
 _NEVER = 1.0                       # m; farther than any shadow reaches
 RATES = 9                          # derivatives, see light_and_rates
 
@@ -435,7 +435,7 @@ def light_and_rates(points: NDArray, panel: PanelPose, height: float,
 
 def _run(points: NDArray, panel: PanelPose, height: float, footprint: NDArray,
          with_rates: bool) -> NDArray:
-    with _LOCK:
+    with THREADS:
         return np.asarray(_irradiance(
             np.ascontiguousarray(points), panel.center, panel.axis, panel.right,
             np.cross(panel.axis, panel.right), np.array(panel.size), panel.lobe_exponent, height,

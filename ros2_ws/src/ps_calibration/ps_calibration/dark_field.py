@@ -28,7 +28,7 @@ from ps_calibration.ring_problem import (
     SOFT,
     STEP,
     corrected,
-    rigid_motion,
+    rigid_motions,
 )
 from ps_calibration.ring_target import RingTarget
 from ps_calibration.robust import soft
@@ -265,8 +265,8 @@ class _Problem:
     def equations(self, x: NDArray) -> NormalEquations:
         panel = self.panel(x)
         light, by = light_and_rates(self.points, panel, self.target.height, self.target.footprint)
-        motions = np.stack([rigid_motion(panel, self.panel(x + step)) / STEP
-                            for step in STEP * np.eye(PER_PANEL)[:-1]])
+        motions = rigid_motions([panel], [
+            [self.panel(x + step)] for step in STEP * np.eye(PER_PANEL)[:-1]])[:, 0] / STEP
         left, slope = soft((panel.intensity * light - self.values) / (self.noise * SOFT))
         rates = np.concatenate([motions @ by[:, :6].T, light[None]])
         rates *= panel.intensity * slope / self.noise

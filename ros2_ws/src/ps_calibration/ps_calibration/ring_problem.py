@@ -168,7 +168,8 @@ class RingProblem:
         for k in range(PER_PANEL - 1):
             steps[k, k:4 * PER_PANEL:PER_PANEL] = STEP      # of all four panels, each its own
         steps[PER_PANEL - 1:, common] = STEP * np.eye(len(common))
-        moved = [self.panels(x + step, position) for step in steps]
+        motions = rigid_motions(
+            panels, [self.panels(x + step, position) for step in steps]) / STEP
         shifts = [(self.points(x + step, position) - points).T / STEP
                   for step in STEP * np.eye(self.size)[pose]]
         light = np.empty((4, len(points)))
@@ -176,9 +177,8 @@ class RingProblem:
         for i, panel in enumerate(panels):
             own, by = light_and_rates(points, panel, x[-1], self.target.footprint)
             light[i], by = panel.intensity * own, panel.intensity * by.T
-            motions = np.stack([rigid_motion(panel, after[i]) for after in moved]) / STEP
             last = (i + 1) * PER_PANEL - 1
-            rates[[*range(i * PER_PANEL, last), *common], i] = motions @ by[:6]
+            rates[[*range(i * PER_PANEL, last), *common], i] = motions[:, i] @ by[:6]
             rates[last, i] = light[i]
             for k, shift in zip(pose, shifts, strict=True):
                 rates[k, i] += by[6] * shift[0] + by[7] * shift[1]
@@ -209,11 +209,18 @@ class RingProblem:
         return sums
 
 
-def rigid_motion(before: PanelPose, after: PanelPose) -> NDArray:
-    """Small shift and turn from one pose to another, (6,)."""
-    first, second = (np.stack([pose.axis, pose.right, np.cross(pose.axis, pose.right)])
-                     for pose in (before, after))
-    return np.concatenate([after.center - before.center,
-                           0.5 * np.cross(first, second - first).sum(axis=0)])
+def rigid_motions(before: Sequence[PanelPose], after: Sequence[Sequence[PanelPose]]) -> NDArray:
+    """Small shifts and turns of P panels in K ways, (K, P, 6).
 
+    :param after: K times the P poses.
+    """
+    def vectors(names: Sequence[str], rows: Sequence[Sequence[PanelPose]]) -> NDArray:
+        return np.array([[[getattr(pose, name) for name in names] for pose in row]
+                         for row in rows])
 
+    first, second = (vectors(('axis', 'right'), rows) for rows in ([before], after))
+    first, second = (np.concatenate([pair, np.cross(*np.moveaxis(pair, 2, 0))[:, :, None]], axis=2)
+                     for pair in (first, second))
+    return np.concatenate([
+        vectors(('center',), after)[:, :, 0] - vectors(('center',), [before])[:, :, 0],
+        0.5 * np.cross(first, second - first).sum(axis=2)], axis=-1)

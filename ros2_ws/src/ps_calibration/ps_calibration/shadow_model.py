@@ -24,6 +24,7 @@ _FAST: dict[str, Any] = {'cache': True, 'fastmath': True, 'error_model': 'numpy'
 _PARTS = 8                         # the panel's width is divided into, at least
 THREADS = threading.Lock()         # numba's plain threading layer allows one caller at a time
 _NEVER = 1.0                       # m; farther than any shadow reaches
+_STRIPES = 64
 RATES = 9                          # derivatives, see light_and_rates
 
 
@@ -234,6 +235,16 @@ def _wall_edges(x, y, forward, side, first, last, limit, f, out, ways):  # type:
 
 
 @nb.njit(**_FAST)
+def _clear(a, b, x, y, forward, side, limit, f):  # type: ignore[no-untyped-def]
+    """Whether no wall stands in directions between which no face of it begins or ends."""
+    inset = 1e-6 * (b - a)
+    for t in (a + inset, 0.5 * (a + b), b - inset):
+        if _wall(t, x, y, forward, side, limit, f)[0] < _NEVER:
+            return False
+    return True
+
+
+@nb.njit(**_FAST)
 def _crossing(a, b, over_a, over_b, low_edge, x, y, forward, side, edges, height, limit, f):  # type: ignore[no-untyped-def]
     """Direction in which the wall's top crosses an edge of the panel (Illinois' rule)."""
     for _ in range(4):
@@ -269,13 +280,16 @@ def _hidden_part(begin, end, x, y, forward, side, edges, turns, axis, lobe, heig
         middle = min(max(_crossing(begin, end, crown_a - high_a, crown_b - high_b, False, x, y,
                                    forward, side, edges, height, limit, f), a), b)
     total = 0.0
-    for start, stop in ((a, middle), (middle, b)):
+    # on either side of the middle the wall hides all the panel, or it ends in it
+    for start, stop, whole in ((a, middle, crown_a > high_a), (middle, b, crown_b > high_b)):
         for k in range(4 if stop - start > 1e-12 else 0):
             t = 0.5 * (start + stop) + 0.5 * (stop - start) * _NODES_4[k]
             low, high, below, above = _column(t, forward, side, edges)
-            wall = _wall(t, x, y, forward, side, limit, f)
-            if height / wall[0] < high:
-                high, above = height / wall[0], -1
+            wall = (_NEVER, 0.0, 0.0)
+            if not whole:
+                wall = _wall(t, x, y, forward, side, limit, f)
+                if height / wall[0] < high:
+                    high, above = height / wall[0], -1
             if high > low:
                 total += _strip(low, high, below, above, wall, t,
                                 0.5 * (stop - start) * _WEIGHTS_4[k] / (1.0 + t * t), forward,
@@ -373,6 +387,8 @@ def _hidden(x, y, centre, axis, right, up, size, lobe, height, whole, rates):  #
     f = f[:_within(x, y, limit, whole, f)]
     ways = np.empty(breaks.shape)
     n = 4 + _wall_edges(x, y, forward, side, first, last, limit, f, breaks[4:], ways[4:])
+    if n == 4 and _clear(first, last, x, y, forward, side, limit, f):
+        return 0.0
     edges, turns = np.empty((4, 3)), np.empty((4 if rates.size else 0, 6, 3))
     _outlines(q, axis[0] * q[0] + axis[1] * q[1] + axis[2] * q[2], axis, right, up, size, edges,
               turns, rates.size > 0)
@@ -384,6 +400,8 @@ def _hidden(x, y, centre, axis, right, up, size, lobe, height, whole, rates):  #
     for k in range(n - 1):
         gap = breaks[k + 1] - breaks[k]
         parts = int(gap / (last - first) * _PARTS) + 1 if gap > 1e-9 else 0
+        if parts > 1 and _clear(breaks[k], breaks[k + 1], x, y, forward, side, limit, f):
+            continue
         for part in range(parts):
             total += _hidden_part(
                 breaks[k] + gap * part / parts, breaks[k] + gap * (part + 1) / parts, x, y,
@@ -394,16 +412,18 @@ def _hidden(x, y, centre, axis, right, up, size, lobe, height, whole, rates):  #
 @nb.njit(parallel=True, **_FAST)
 def _irradiance(points, centre, axis, right, up, size, lobe, height, f, with_rates):  # type: ignore[no-untyped-def]
     out = np.zeros((points.shape[0], 1 + RATES if with_rates else 1))
-    for k in nb.prange(points.shape[0]):
-        x, y = points[k, 0], points[k, 1]
-        rates = out[k, 1:]
-        out[k, 0] = _panel(x, y, centre, axis, right, up, size, lobe, rates)
-        if height > 0.0 and out[k, 0] > 0.0:
-            out[k, 0] -= _hidden(x, y, centre, axis, right, up, size, lobe, height, f, rates)
-        if with_rates:
-            # panel, wall and point moved together change nothing
-            rates[6] -= rates[0]
-            rates[7] -= rates[1]
+    # points in shadow take longest and lie together: each thread gets some of everywhere
+    for stripe in nb.prange(_STRIPES):
+        for k in range(stripe, points.shape[0], _STRIPES):
+            x, y = points[k, 0], points[k, 1]
+            rates = out[k, 1:]
+            out[k, 0] = _panel(x, y, centre, axis, right, up, size, lobe, rates)
+            if height > 0.0 and out[k, 0] > 0.0:
+                out[k, 0] -= _hidden(x, y, centre, axis, right, up, size, lobe, height, f, rates)
+            if with_rates:
+                # panel, wall and point moved together change nothing
+                rates[6] -= rates[0]
+                rates[7] -= rates[1]
     return out
 
 

@@ -11,6 +11,9 @@ from ps_head_driver.head_model import DIRECTIONS
 _FAILED_RMS, _POOR_RMS = 0.02, 0.006     # of the shares of light
 _UNLIKELY = 1.7          # corrections, relative to the tolerances they were given
 _Z_SCALE = 0.03, 0.06    # of the wall's height: doubtful, and certainly another target
+_Z_DOUBT = 0.006         # of it: lights would be off by 0.2 degrees
+_Z_NOISE = 4             # standard deviations of the height, below which nothing is said
+_TURN = 0.3              # degrees of the lights for 1 % of the wall's height
 _NO_WALL = 0.4           # of the wall's height, below which there is none
 _BLOCKED = 0.5           # of a slit
 _LIMIT = np.array([0.006, 0.006, 0.006, 0.07, 0.07, 0.25])
@@ -42,8 +45,8 @@ def judge(fit: RingFit, free: RingFit, target: RingTarget, blocked: NDArray) -> 
     if abs(height - 1) > _Z_SCALE[0] and _rms(free) < max(0.8 * rms, _POOR_RMS):
         certain = rms > _FAILED_RMS or abs(height - 1) > _Z_SCALE[1]
         return ('FAILED' if certain else 'POOR'), (
-            f'the wall seems to be {"higher" if height > 1 else "lower"} than the target file '
-            f'says (fitted {1e3 * free.height:.2f} mm); is it the right target and file?')
+            f'{_other_height(free, height)}; is it the right target and file, and is the plate '
+            'matt?')
     if rms > _FAILED_RMS:
         return 'FAILED', (f'the shadows do not fit this target (residual {rms:.3f}); is it '
                           'another ring than the target file says, or damaged?')
@@ -55,4 +58,15 @@ def judge(fit: RingFit, free: RingFit, target: RingTarget, blocked: NDArray) -> 
     if rms > _POOR_RMS:
         return 'POOR', (f'the shadows fit badly (residual {rms:.3f}); clean the target and keep '
                         'other light away')
+    if abs(height - 1) > max(_Z_DOUBT, _Z_NOISE * free.height_deviation / target.height):
+        return 'POOR', (f'{_other_height(free, height)}; measure the wall (a rounded upper edge '
+                        'counts as missing height), correct the file and see that the plate is '
+                        f'matt: the lights may be off by {_TURN * abs(height - 1) * 100:.1f} '
+                        'degrees')
     return 'OK', ''
+
+
+def _other_height(free: RingFit, height: float) -> str:
+    return (f'the wall seems to be {100 * abs(height - 1):.1f} % '
+            f'{"higher" if height > 1 else "lower"} than the target file says (fitted '
+            f'{1e3 * free.height:.3f} mm)')

@@ -84,6 +84,16 @@ def test_a_dirty_scratched_and_shiny_target_will_do(
     assert result.z_scale == pytest.approx(1, abs=0.005)
 
 
+def test_a_wall_that_is_a_little_lower_than_its_file_says_is_told(
+        stack: Stack, target: RingTarget, nominal: HeadModel) -> None:
+    wrong = target.model_copy(update={'height': 1.012 * target.height})
+    result = calibrate([stack], wrong, nominal)
+    assert result.verdict == 'POOR'
+    assert 'lower than the target file says' in result.reason, result.reason
+    assert 1e3 * target.height == pytest.approx(
+        float(result.reason.split('(fitted ')[1].split(' mm')[0]), abs=0.02)
+
+
 # those that cost no fit; tests/bench/bench_calibration_verdicts.py has the rest
 QUICK = ('target turned over', 'ring with other dots', 'a machined disc instead', 'panel N dead',
          'panels E and N swapped', 'pictures mirrored', 'frame E saturated', 'all frames dark',

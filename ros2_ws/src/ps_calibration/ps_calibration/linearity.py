@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 _BLOCK_PX = 8
 _SMOOTH = 0.05           # deviation in a block, of a well-lit plate: no edge of a dot or the wall
 _LIT = 0.1               # of a well-lit plate: darker blocks tell little
+_SHADED, _SHADOWS = 0.05, 0.003   # share of a panel in its shadow; part of the blocks there
 _ROUNDS = 6
 
 
@@ -36,6 +37,8 @@ def response_exponent(singles: Sequence[NDArray], together: NDArray) -> tuple[fl
     if use.sum() < 100 or level <= 0:
         return math.nan, math.inf
     parts, whole = means[:4, use].clip(1e-6 * level), means[4, use]
+    if np.mean(parts.min(axis=0) < _SHADED * parts.sum(axis=0)) < _SHADOWS:
+        return math.nan, math.inf      # without shadows, fall-off looks like a bent response
     exponent = deviation = 1.0
     for _ in range(_ROUNDS):
         shares = parts ** (1 / exponent) / whole ** (1 / exponent)

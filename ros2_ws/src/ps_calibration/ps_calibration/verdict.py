@@ -15,7 +15,8 @@ _Z_DOUBT = 0.006         # of it: lights would be off by 0.2 degrees
 _Z_NOISE = 4             # standard deviations of the height, below which nothing is said
 _TURN = 0.3              # degrees of the lights for 1 % of the wall's height
 _NO_WALL = 0.4           # of the wall's height, below which there is none
-_BLOCKED = 0.5           # of a slit
+_BLOCKED = 0.6           # of a slit
+_SOFT = 6.0              # of the pictures, see RingFit.softness: they should be 1 or 2
 _LIMIT = np.array([0.006, 0.006, 0.006, 0.07, 0.07, 0.25])
 
 
@@ -56,8 +57,11 @@ def judge(fit: RingFit, free: RingFit, target: RingTarget, blocked: NDArray) -> 
         return 'FAILED', (f'panel {name} would be far out of its place; is it another ring than '
                           'the target file says? if not, check the mounting of the panel')
     if rms > _POOR_RMS:
-        return 'POOR', (f'the shadows fit badly (residual {rms:.3f}); clean the target and keep '
-                        'other light away')
+        return 'POOR', (f'the shadows fit badly (residual {rms:.3f}); clean the target, keep '
+                        'other light away, and check that it is the one of the target file')
+    if fit.softness > _SOFT:
+        return 'POOR', ('the pictures are blurred; focus the camera and see that nothing '
+                        'vibrates')
     if abs(height - 1) > max(_Z_DOUBT, _Z_NOISE * free.height_deviation / target.height):
         return 'POOR', (f'{_other_height(free, height)}; measure the wall (a rounded upper edge '
                         'counts as missing height), correct the file and see that the plate is '

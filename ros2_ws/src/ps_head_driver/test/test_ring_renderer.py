@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from ps_head_driver.errors import PsError
-from ps_head_driver.fake.renderer import OFF, Sensor, make_renderer
-from ps_head_driver.fake.ring_renderer import _blocked, _enters
+from ps_head_driver.fake.renderer import OFF, Sensor, emitters, make_renderer
+from ps_head_driver.fake.ring_renderer import RingSolid, _meets
 from ps_head_driver.head_model import load_head, nominal_head_path
 
 HEAD = load_head(nominal_head_path())
@@ -17,18 +17,61 @@ def ring(arguments: str = ''):
     return make_renderer(f'ring:{arguments}', HEAD, CLEAN, scale=0.1)
 
 
-def test_both_shadow_tests_agree():
-    footprint = np.array([0.010, 0.012, 0.004, 0.0004])
-    ends = np.array([1.0, 0.0, -1.0, 0.0])
-    azimuths = np.array([0.3, 1.5, 2.8])
-    slits = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
-    buffer = np.empty(32)
-    answers = []
+def in_wall(x, y):
+    """Whether the wall of the shipped target stands above points of its frame."""
+    solid = RingSolid()
+    radius, azimuth = np.hypot(x, y), np.arctan2(y, x)
+    inside = (radius >= solid.radii[0]) & (radius <= solid.radii[1]) & (azimuth >= 0)
+    for slit in solid.slits:
+        along = np.cos(slit) * x + np.sin(slit) * y
+        across = np.cos(slit) * y - np.sin(slit) * x
+        inside &= (along < 0) | (np.abs(across) > solid.slit_width / 2)
+    return inside
+
+
+def test_ways_end_where_steps_along_them_enter_the_wall():
+    solid = RingSolid()
+    footprint = (*solid.radii, solid.height, solid.slit_width / 2)
+    slits = np.stack([np.cos(solid.slits), np.sin(solid.slits)], axis=1)
+    steps, met = np.linspace(0, 1, 4001), 0
     for start, way in np.random.default_rng(1).uniform(-0.02, 0.02, (5000, 2, 2)):
-        blocked = _blocked(*start, *way, footprint, ends, slits)
-        assert blocked == (_enters(*start, *way, footprint, ends, slits, buffer) < 1)
-        answers.append(blocked)
-    assert 500 < sum(answers) < 4500
+        found = _meets(*start, *way, footprint, (1.0, 0.0, -1.0, 0.0), slits)
+        points = start[:, None] + way[:, None] * steps
+        entered = steps[in_wall(*points)]
+        if entered.size and found > 1:      # a corner, cut between two steps, is no hit
+            assert entered.size <= 1
+        elif found <= 1:
+            met += 1
+            assert in_wall(*(start + way * min(found + 1e-9, 1.0)))
+            if entered.size:
+                assert found == pytest.approx(entered[0], abs=2 / 4000)
+    assert 1000 < met < 4000
+
+
+@pytest.mark.parametrize(('panel', 'tilt'), [('bright', math.radians(30)), ('dark', 1.3)])
+def test_soft_shadows_are_those_of_many_lamps(panel, tilt):
+    """Against a thousand lamps over the panel, their light stepped through the solid."""
+    renderer = ring()
+    pose = getattr(renderer, f'_{panel}').panel_pose('E', tilt)
+    lamps = emitters(pose, (40, 25), gauss=False)[0][:3].T
+    points = renderer._points[:, :3]
+    radiance = renderer.panel_radiance(pose).ravel() / renderer.albedo.ravel() * math.pi
+    bare = ring('defect=no_wall')
+    free = bare.panel_radiance(pose).ravel() / bare.albedo.ravel() * math.pi
+    seen = radiance / free
+    partly = np.flatnonzero((points[:, 2] == 0) & (seen > 0.03) & (seen < 0.97))
+    assert partly.size > 200
+    steps, errors = np.linspace(0, 1, 600), []
+    for k in np.random.default_rng(2).choice(partly, 40, replace=False):
+        way = lamps - points[k]
+        distance = np.linalg.norm(way, axis=1)
+        light = -(way @ pose.axis) * way[:, 2] / distance ** 4
+        reach = 0.004 / way[:, 2]           # of the way to where it is above the wall
+        x, y = (points[k, i] + (way[:, i] * reach)[:, None] * steps for i in (0, 1))
+        passed = ~in_wall(x, y).any(axis=1)
+        errors.append(seen[k] - (light * passed).sum() / light.sum())
+    assert np.abs(errors).max() < 0.03
+    assert np.abs(np.mean(errors)) < 0.003
 
 
 def test_it_lies_where_it_is_put():

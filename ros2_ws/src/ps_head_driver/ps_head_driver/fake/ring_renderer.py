@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ps_head_driver.camera_model import camera_center, pixel_rays
 from ps_head_driver.errors import ErrorCode, PsError
-from ps_head_driver.fake.kernels import KERNEL_LOCK
+from ps_head_driver.fake.kernels import FAST, KERNEL_LOCK, RUN, TURNS
 from ps_head_driver.fake.renderer import OFF, Renderer, Sensor, emitters
 from ps_head_driver.fake.scenes import checked_arguments
 from ps_head_driver.head_model import HeadModel
@@ -24,10 +24,11 @@ from ps_head_driver.kinematics import PanelPose
 from ps_head_driver.stack import Truth
 
 _FREE = (6, 4)              # emitters along a panel's width and height where no shadow falls
-# and elsewhere, on a lattice of two neighbours of Fibonacci's: no edge, however it lies, hides
-# whole rows of it at once, as it would of a grid along the sides of the panel
-_SHADOWED, _TURN = 610, 377
-_PROBES = (7, 5)            # on its edges and inside: where all are free, nothing is in the way
+_PARTS = (5, 3)             # of a panel along width and height, for shadows
+# emitters in a part of the panel that is partly hidden, on a lattice of two neighbours of
+# Fibonacci's: no edge, however it lies, hides whole rows of it at once, as it would of a grid
+_LATTICE, _TURN = 21, 13
+_CLEAR = 2.0                # fraction of a way at which nothing is met
 
 
 def _default_dots() -> NDArray:
@@ -91,141 +92,89 @@ def placement(x: float = 0.0, y: float = 0.0, z: float = 0.0, turn: float = 0.0,
         [c * along + s * across, -s * along + c * across, normal], axis=1))
 
 
-@nb.njit(cache=True)
-def _solid(x, y, ring, ends, slits):  # type: ignore[no-untyped-def]
-    """Whether the wall stands above (x, y)."""
-    square = x * x + y * y
-    if square < ring[0] * ring[0] or square > ring[1] * ring[1]:
-        return False
-    if ends[0] * y - ends[1] * x < 0.0 or x * ends[3] - y * ends[2] < 0.0:
-        return False
-    for k in range(slits.shape[0]):
-        if (abs(slits[k, 0] * y - slits[k, 1] * x) < ring[3]
-                and slits[k, 0] * x + slits[k, 1] * y > 0.0):
-            return False
-    return True
-
-
-@nb.njit(cache=True)
-def _crossings(x, y, dx, dy, ring, ends, slits, out):  # type: ignore[no-untyped-def]
-    """Fractions 0..1 of the way (dx, dy) from (x, y) at which a face may be crossed, sorted."""
-    n = 0
-    a, b = dx * dx + dy * dy, x * dx + y * dy
-    for k in range(2):
-        c = x * x + y * y - ring[k] * ring[k]
-        inside = b * b - a * c
-        if inside > 0.0 and a > 0.0:
-            root = math.sqrt(inside)
-            for s in ((-b - root) / a, (-b + root) / a):
-                if 0.0 < s < 1.0:
-                    out[n] = s
-                    n += 1
-    for k in range(2):
-        slope = ends[2 * k] * dy - ends[2 * k + 1] * dx
-        if slope != 0.0:
-            s = -(ends[2 * k] * y - ends[2 * k + 1] * x) / slope
-            if 0.0 < s < 1.0:
-                out[n] = s
-                n += 1
-    for k in range(slits.shape[0]):
-        slope = slits[k, 0] * dy - slits[k, 1] * dx
-        if slope != 0.0:
-            offset = slits[k, 0] * y - slits[k, 1] * x
-            for s in ((ring[3] - offset) / slope, (-ring[3] - offset) / slope):
-                if 0.0 < s < 1.0:
-                    out[n] = s
-                    n += 1
-    out[:n].sort()
-    return n
-
-
-@nb.njit(cache=True)
-def _enters(x, y, dx, dy, ring, ends, slits, buffer):  # type: ignore[no-untyped-def]
-    """Fraction of the way at which the wall is first met; 2 if it is not."""
-    if _solid(x, y, ring, ends, slits):
-        return 0.0
-    # most ways stay clear of the whole ring
-    a, b, square = dx * dx + dy * dy, x * dx + y * dy, x * x + y * y
-    s = min(max(-b / a, 0.0), 1.0)
-    if square + s * (2.0 * b + s * a) > ring[1] * ring[1]:
-        return 2.0
-    if max(square, square + 2.0 * b + a) < ring[0] * ring[0]:
-        return 2.0
-    n = _crossings(x, y, dx, dy, ring, ends, slits, buffer)
-    for k in range(n):
-        after = 0.5 * (buffer[k] + (buffer[k + 1] if k + 1 < n else 1.0))
-        if _solid(x + after * dx, y + after * dy, ring, ends, slits):
-            return buffer[k]
-    return 2.0
-
-
-@nb.njit(cache=True, inline='always')
+@nb.njit(forceinline=True, **FAST)
 def _beyond(offset, slope, begin, end):  # type: ignore[no-untyped-def]
-    """Part of begin..end in which offset + s * slope is positive."""
-    if slope == 0.0:
-        return (begin, end) if offset > 0.0 else (1.0, 0.0)
+    """Part of begin..end in which offset + s * slope is positive; empty if begin >= end."""
+    first, last = offset + begin * slope, offset + end * slope
+    if first > 0.0 and last > 0.0:
+        return begin, end
+    if first <= 0.0 and last <= 0.0:
+        return end, end
     s = -offset / slope
-    return (max(begin, s), end) if slope > 0.0 else (begin, min(end, s))
+    return (s, end) if slope > 0.0 else (begin, s)
 
 
-@nb.njit(cache=True)
-def _passes_slit(x, y, dx, dy, begin, end, half_width, slits):  # type: ignore[no-untyped-def]
-    """Whether the way from begin to end, all within the ring, lies in one slit."""
+@nb.njit(forceinline=True, **FAST)
+def _past_slit(x, y, dx, dy, begin, end, half_width, slits):  # type: ignore[no-untyped-def]
+    """Where the way from begin to end, all within the ring, meets the wall; _CLEAR if nowhere."""
     for k in range(slits.shape[0]):
         offset = slits[k, 0] * y - slits[k, 1] * x
         slope = slits[k, 0] * dy - slits[k, 1] * dx
-        if (abs(offset + begin * slope) <= half_width and abs(offset + end * slope) <= half_width
+        if (abs(offset + begin * slope) <= half_width
                 and slits[k, 0] * (x + begin * dx) + slits[k, 1] * (y + begin * dy) > 0.0):
-            return True
-    return False
+            # it starts in this slit
+            if abs(offset + end * slope) <= half_width:
+                return _CLEAR
+            return (math.copysign(half_width, slope) - offset) / slope
+    return begin
 
 
-@nb.njit(cache=True)
-def _blocked(x, y, dx, dy, ring, ends, slits):  # type: ignore[no-untyped-def]
-    """Whether the way (dx, dy) from (x, y) meets the wall; the same answer as _enters, sooner."""
+@nb.njit(forceinline=True, **FAST)
+def _meets(x, y, dx, dy, ring, ends, slits):  # type: ignore[no-untyped-def]
+    """Fraction of the way (dx, dy) from (x, y) at which the wall is met; _CLEAR if it is not.
+
+    :param ring: inner and outer radius, height, half the width of a slit.
+    :param ends: cosine and sine of the wall's first azimuth, and of its last.
+    :param slits: (K, 2) cosines and sines of the slits.
+    """
     a, b, square = dx * dx + dy * dy, x * dx + y * dy, x * x + y * y
     within = b * b - a * (square - ring[1] * ring[1])
     if within <= 0.0 or a <= 0.0:
-        return False
-    root = math.sqrt(within)
-    begin, end = max((-b - root) / a, 0.0), min((-b + root) / a, 1.0)
+        return _CLEAR
+    root, per = math.sqrt(within), 1.0 / a
+    begin, end = max((-b - root) * per, 0.0), min((-b + root) * per, 1.0)
+    if begin >= end:
+        return _CLEAR
     begin, end = _beyond(ends[0] * y - ends[1] * x, ends[0] * dy - ends[1] * dx, begin, end)
     begin, end = _beyond(ends[3] * x - ends[2] * y, ends[3] * dx - ends[2] * dy, begin, end)
     if begin >= end:
-        return False
+        return _CLEAR
     # what is left, less the way across the hollow of the ring
     hollow = b * b - a * (square - ring[0] * ring[0])
     if hollow <= 0.0:
-        return not _passes_slit(x, y, dx, dy, begin, end, ring[3], slits)
+        return _past_slit(x, y, dx, dy, begin, end, ring[3], slits)
     root = math.sqrt(hollow)
-    first, last = min((-b - root) / a, end), max((-b + root) / a, begin)
-    return ((begin < first and not _passes_slit(x, y, dx, dy, begin, first, ring[3], slits))
-            or (last < end and not _passes_slit(x, y, dx, dy, last, end, ring[3], slits)))
+    first, last = min((-b - root) * per, end), max((-b + root) * per, begin)
+    met = _CLEAR
+    if begin < first:
+        met = _past_slit(x, y, dx, dy, begin, first, ring[3], slits)
+    if met == _CLEAR and last < end:
+        met = _past_slit(x, y, dx, dy, last, end, ring[3], slits)
+    return met
 
 
-@nb.njit(cache=True, parallel=True)
+@nb.njit(parallel=True, **FAST)
 def _look(origin, rays, ring, ends, slits, plate, dots, dot_radius, reflectance, pixel):  # type: ignore[no-untyped-def]
     """What each ray of the camera meets, in the target frame.
 
-    :returns: (N, 7): point, normal, reflectance.
+    :returns: (N, 4): point, reflectance.
     """
-    out = np.zeros((rays.shape[0], 7))
+    out = np.zeros((rays.shape[0], 4))
     height = ring[2]
     for k in nb.prange(rays.shape[0]):
-        buffer = np.empty(32)
         foot = -origin[2] / rays[k, 2]
         crown = (height - origin[2]) / rays[k, 2]
         x, y = origin[0] + crown * rays[k, 0], origin[1] + crown * rays[k, 1]
         dx, dy = (foot - crown) * rays[k, 0], (foot - crown) * rays[k, 1]
-        met = _enters(x, y, dx, dy, ring, ends, slits, buffer) if height > 0.0 else 2.0
+        met = _meets(x, y, dx, dy, ring, ends, slits) if height > 0.0 else _CLEAR
         if met == 0.0:
-            out[k] = np.array([x, y, height, 0.0, 0.0, 1.0, reflectance[0]])
+            out[k] = np.array([x, y, height, reflectance[0]])
         elif met < 1.0:
             # the wall's own shading is of no use to anybody: give it that of a level face; a
             # little in front of it, so that it does not shadow itself by chance
             met -= 1e-6
             out[k] = np.array([x + met * dx, y + met * dy, height * (1.0 - met),
-                               0.0, 0.0, 1.0, 0.5 * reflectance[0]])
+                               0.5 * reflectance[0]])
         else:
             x, y = x + dx, y + dy
             albedo = reflectance[1]
@@ -236,72 +185,123 @@ def _look(origin, rays, ring, ends, slits, plate, dots, dot_radius, reflectance,
                 beyond = math.hypot(x - dots[d, 0], y - dots[d, 1]) - dot_radius
                 part = min(max(0.5 - beyond / pixel, 0.0), 1.0)
                 albedo += part * (reflectance[2] - albedo)
-            out[k] = np.array([x, y, 0.0, 0.0, 0.0, 1.0, albedo])
+            out[k] = np.array([x, y, 0.0, albedo])
     return out
 
 
-@nb.njit(cache=True, inline='always')
-def _emission(point, dx, dy, dz, axis, lobe):  # type: ignore[no-untyped-def]
-    """Irradiance of a point under a unit of area of the panel, (dx, dy, dz) away."""
-    facing = -(axis[0] * dx + axis[1] * dy + axis[2] * dz)
-    steep = point[3] * dx + point[4] * dy + point[5] * dz
-    if facing <= 0.0 or steep <= 0.0:
-        return 0.0
-    square = dx * dx + dy * dy + dz * dz
-    distance = math.sqrt(square)
-    cos_e = facing / distance
-    return (cos_e if lobe == 1.0 else cos_e ** lobe) * steep / (distance * square)
+@nb.njit(forceinline=True, **FAST)
+def _emission(dx, dy, dz, axis, lobe):  # type: ignore[no-untyped-def]
+    """Irradiance of a level point under a unit of area of the panel, (dx, dy, dz) away."""
+    facing = max(-(axis[0] * dx + axis[1] * dy + axis[2] * dz), 0.0)
+    nearness = 1.0 / math.sqrt(dx * dx + dy * dy + dz * dz)
+    cos_e = facing * nearness
+    return (cos_e if lobe is None else cos_e ** lobe) * max(dz, 0.0) * nearness ** 3
 
 
-@nb.njit(cache=True, parallel=True)
-def _light(points, free, probes, shadowed, corner, sides, axis, lobe, ring, ends, slits):  # type: ignore[no-untyped-def]
-    """Irradiance of each point under one panel, all in the target frame.
+@nb.njit(forceinline=True, **FAST)
+def _piece(x, y, slits):  # type: ignore[no-untyped-def]
+    """Number, from 1, of the piece of wall between slits at (x, y)."""
+    piece = 1
+    for k in range(slits.shape[0]):
+        piece += slits[k, 0] * y - slits[k, 1] * x > 0.0
+    return piece
 
-    :param shadowed: (E, 2) emitters where shadows fall, in fractions of the panel's sides.
-    :param corner: (3,) of the panel, from which its sides (2, 3) run.
+
+@nb.njit(forceinline=True, **FAST)
+def _passes_by(x, y, nodes, ring):  # type: ignore[no-untyped-def]
+    """Whether the whole ring lies to the left or to the right of a panel, seen from (x, y)."""
+    left = right = True
+    last = nodes.shape[1] - 1
+    for e in (0, _PARTS[0], last - _PARTS[0], last):
+        dx, dy = nodes[0, e] - x, nodes[1, e] - y
+        aside = dx * y - dy * x
+        width = ring[1] * math.sqrt(dx * dx + dy * dy)
+        left, right = left and aside > width, right and aside < -width
+    return left or right
+
+
+@nb.njit(forceinline=True, **FAST)
+def _visible(x, y, z, shift, nodes, sides, axis, lobe, lattice, ring, ends, slits, blocked, light):  # type: ignore[no-untyped-def]
+    """Part of a panel's light that passes the wall, by the parts of the panel.
+
+    A part whose four corners are free is free; one whose corners are all behind the same piece of
+    wall is dark; the others are sampled.
+
+    :param shift: (2,) of the emitters in a part, in fractions of its sides.
+    :param nodes: (3, N) corners of the parts; blocked and light are (N,) to work in.
+    :param sides: (2, 3) of a part.
     """
-    out = np.zeros(points.shape[0], np.float32)
-    height = ring[2]
-    # the farthest shadow falls straight away from the lowest side of the panel
-    reach = 0.0
-    for e in range(probes.shape[0]):
-        way = math.hypot(probes[e, 0], probes[e, 1]) + ring[1]
-        reach = max(reach, way * height / max(probes[e, 2] - height, 1e-6))
-    for k in nb.prange(points.shape[0]):
-        x, y, z = points[k, 0], points[k, 1], points[k, 2]
-        total = 0.0
-        for e in range(free.shape[0]):
-            total += free[e, 3] * _emission(points[k], free[e, 0] - x, free[e, 1] - y,
-                                            free[e, 2] - z, axis, lobe)
-        # the sides and the middle of the panel tell whether any shadow falls here
-        near = False
-        if z < height and math.hypot(x, y) < ring[1] + reach:
-            for e in range(probes.shape[0]):
-                dx, dy = probes[e, 0] - x, probes[e, 1] - y
-                s = (height - z) / (probes[e, 2] - z)
-                if _blocked(x, y, s * dx, s * dy, ring, ends, slits):
-                    near = True
-                    break
-        if near:
-            # every pixel looks at other points of the panel (an additive sequence in two
-            # dimensions), lest soft shadows become stairs alike in neighbouring pixels
-            a, b = 0.7548776662466927 * k % 1.0, 0.5698402909980532 * k % 1.0
-            cx, cy, cz = corner[0] - x, corner[1] - y, corner[2] - z
-            seen = whole = 0.0
-            for e in range(shadowed.shape[0]):
-                u, v = shadowed[e, 0] + a, shadowed[e, 1] + b
+    found = False
+    for e in range(nodes.shape[1]):
+        dx, dy, s = nodes[0, e] - x, nodes[1, e] - y, (ring[2] - z) / (nodes[2, e] - z)
+        met = _meets(x, y, s * dx, s * dy, ring, ends, slits)
+        blocked[e] = 0
+        if met != _CLEAR:
+            blocked[e] = _piece(x + met * s * dx, y + met * s * dy, slits)
+            found = True
+    if not found:
+        return 1.0
+    for e in range(nodes.shape[1]):
+        light[e] = _emission(nodes[0, e] - x, nodes[1, e] - y, nodes[2, e] - z, axis, lobe)
+    seen = whole = 0.0
+    for j in range(_PARTS[1]):
+        for i in range(_PARTS[0]):
+            n = j * (_PARTS[0] + 1) + i
+            m = n + _PARTS[0] + 1
+            a, b, c, d = light[n], light[n + 1], light[m], light[m + 1]
+            whole += a + b + c + d
+            by = blocked[n]
+            if by == blocked[n + 1] and by == blocked[m] and by == blocked[m + 1]:
+                seen += a + b + c + d if by == 0 else 0.0
+                continue
+            free = 0.0
+            for e in range(lattice.shape[0]):
+                u, v = lattice[e, 0] + shift[0], lattice[e, 1] + shift[1]
                 u -= u >= 1.0
                 v -= v >= 1.0
-                dx = cx + u * sides[0, 0] + v * sides[1, 0]
-                dy = cy + u * sides[0, 1] + v * sides[1, 1]
-                dz = cz + u * sides[0, 2] + v * sides[1, 2]
-                light = _emission(points[k], dx, dy, dz, axis, lobe)
-                whole += light
-                s = (height - z) / dz
-                if not _blocked(x, y, s * dx, s * dy, ring, ends, slits):
-                    seen += light
-            total *= seen / whole if whole > 0.0 else 0.0
-        out[k] = total
+                dx = nodes[0, n] - x + u * sides[0, 0] + v * sides[1, 0]
+                dy = nodes[1, n] - y + u * sides[0, 1] + v * sides[1, 1]
+                dz = nodes[2, n] - z + u * sides[0, 2] + v * sides[1, 2]
+                s = (ring[2] - z) / dz
+                if _meets(x, y, s * dx, s * dy, ring, ends, slits) == _CLEAR:
+                    free += (1.0 - v) * (a + u * (b - a)) + v * (c + u * (d - c))
+            seen += 4.0 * free / lattice.shape[0]
+    return seen / whole if whole > 0.0 else 0.0
+
+
+@nb.njit(parallel=True, **FAST)
+def _light(points, free, nodes, sides, lattice, axis, lobe, ring, ends, slits):  # type: ignore[no-untyped-def]
+    """Irradiance of each point under one panel, all in the target frame.
+
+    :param free: (4, E) emitters: position and area, of the whole panel.
+    :param nodes: (3, N) corners of the panel's _PARTS, row by row.
+    :param sides: (2, 3) of a part.
+    :param lattice: (F, 2) emitters in a part where shadows fall, in fractions of its sides.
+    """
+    count = points.shape[0]
+    out = np.empty(count, np.float32)
+    # the farthest shadow falls straight away from the lowest side of the panel
+    reach = 0.0
+    for e in range(nodes.shape[1]):
+        far = math.hypot(nodes[0, e], nodes[1, e]) + ring[1]
+        reach = max(reach, far * ring[2] / max(nodes[2, e] - ring[2], 1e-6))
+    for turn in nb.prange(TURNS):
+        blocked, light = np.empty(nodes.shape[1], np.int8), np.empty(nodes.shape[1])
+        for start in range(turn * RUN, count, TURNS * RUN):
+            for k in range(start, min(start + RUN, count)):
+                x, y, z = points[k, 0], points[k, 1], points[k, 2]
+                total = 0.0
+                for e in range(free.shape[1]):
+                    total += free[3, e] * _emission(free[0, e] - x, free[1, e] - y,
+                                                    free[2, e] - z, axis, lobe)
+                if (z < ring[2] and x * x + y * y < (ring[1] + reach) ** 2
+                        and not _passes_by(x, y, nodes, ring)):
+                    # every pixel looks at other points of the panel (an additive sequence in two
+                    # dimensions), lest soft shadows become stairs alike in neighbouring pixels
+                    shift = (0.7548776662466927 * k % 1.0, 0.5698402909980532 * k % 1.0)
+                    total *= _visible(x, y, z, shift, nodes, sides, axis, lobe, lattice, ring,
+                                      ends, slits, blocked, light)
+                out[k] = total
     return out
 
 
@@ -318,8 +318,8 @@ class RingRenderer(Renderer):
                  sensor: Sensor | None = None, scale: float = 1.0, seed: int = 1) -> None:
         super().__init__(head, sensor, scale, seed)
         self._where = where
-        self._ring = np.array([*solid.radii, solid.height, solid.slit_width / 2])
-        self._ends = np.array([f(a) for a in solid.arc for f in (math.cos, math.sin)])
+        self._ring = (*solid.radii, solid.height, solid.slit_width / 2)
+        self._ends = tuple(f(a) for a in solid.arc for f in (math.cos, math.sin))
         self._slits = np.array([[math.cos(a), math.sin(a)] for a in solid.slits]).reshape(-1, 2)
         v, u = np.mgrid[:self.shape[0], :self.shape[1]]
         rays = pixel_rays(self.camera, np.stack([u, v], axis=-1)).reshape(-1, 3)
@@ -334,7 +334,7 @@ class RingRenderer(Renderer):
     @property
     def albedo(self) -> NDArray:
         """Diffuse reflectance of what each pixel sees, (H, W) float32."""
-        return self._points[:, 6].astype(np.float32).reshape(self.shape)
+        return self._points[:, 3].astype(np.float32).reshape(self.shape)
 
     def truth(self) -> Truth:
         """True normals (n_plane) and heights; NaN normals on the vertical walls."""
@@ -350,28 +350,28 @@ class RingRenderer(Renderer):
         self._irradiance(self._points[:1], self._bright.panel_pose('E', 0.5))
 
     def _trace(self, pose: PanelPose) -> NDArray:
-        radiance = (self._irradiance(self._points, pose) * self._points[:, 6]
+        radiance = (self._irradiance(self._points, pose) * self._points[:, 3]
                     * pose.intensity / math.pi)
         return np.asarray(radiance.astype(np.float32).reshape(self.shape))
 
     def _irradiance(self, points: NDArray, pose: PanelPose) -> NDArray:
         """Irradiance of points in the target frame under a panel of unit radiance, (N,)."""
         where = self._where
-        free = emitters(pose, _FREE, gauss=True)[0].T.copy()
-        free[:, :3] = (free[:, :3] - where.position) @ where.rotation
+        free = emitters(pose, _FREE, gauss=True)[0]
+        free[:3] = where.rotation.T @ (free[:3] - where.position[:, None])
         sides = np.stack([pose.size[0] * pose.right,
-                          pose.size[1] * np.cross(pose.axis, pose.right)])
-        corner = pose.center - sides.sum(axis=0) / 2
-        u, v = (grid.ravel() for grid in np.meshgrid(*(np.linspace(0, 1, n) for n in _PROBES)))
-        probes = corner + np.stack([u, v], axis=1) @ sides
-        e = np.arange(_SHADOWED)
-        lattice = np.stack([e, _TURN * e % _SHADOWED], axis=1) / _SHADOWED
+                          pose.size[1] * np.cross(pose.axis, pose.right)]) @ where.rotation
+        centre = (pose.center - where.position) @ where.rotation
+        u, v = (grid.ravel() for grid in np.meshgrid(*(np.linspace(-0.5, 0.5, n + 1)
+                                                       for n in _PARTS)))
+        nodes = centre[:, None] + sides.T @ np.stack([u, v])
+        e = np.arange(_LATTICE)
+        lattice = np.stack([e, _TURN * e % _LATTICE], axis=1) / _LATTICE
+        lobe = None if pose.lobe_exponent == 1 else pose.lobe_exponent
         with KERNEL_LOCK:
             return np.asarray(_light(
-                points, free, (probes - where.position) @ where.rotation, lattice,
-                (corner - where.position) @ where.rotation, sides @ where.rotation,
-                pose.axis @ where.rotation, pose.lobe_exponent, self._ring, self._ends,
-                self._slits))
+                points, free, nodes, sides / np.array(_PARTS)[:, None], lattice,
+                pose.axis @ where.rotation, lobe, self._ring, self._ends, self._slits))
 
     def capture(self, tilt: float, exposure: float = 1.0) -> list[NDArray]:
         """The six pictures of a calibration: E, N, W, S, ALL at a quarter exposure, NONE.

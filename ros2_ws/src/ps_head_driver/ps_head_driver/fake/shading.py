@@ -16,7 +16,7 @@ AZIMUTHS = 2 * COARSE - 1      # and with those between where there are some
 _PI = math.pi
 
 
-@nb.njit(inline='always', **FAST)
+@nb.njit(forceinline=True, **FAST)
 def _contribution(dx, dy, dz, area, axis, lobe, normal, view, finish):  # type: ignore[no-untyped-def]
     """Radiance that an emitter (dx, dy, dz) away sends to the camera over a point.
 
@@ -45,7 +45,7 @@ def _contribution(dx, dy, dz, area, axis, lobe, normal, view, finish):  # type: 
     return reflected * emission * cos_l * nearness * nearness * area
 
 
-@nb.njit(inline='always', **FAST)
+@nb.njit(forceinline=True, **FAST)
 def _finish(albedo, gloss, normal, view):  # type: ignore[no-untyped-def]
     """What the sums over emitters have in common at one point.
 
@@ -102,7 +102,7 @@ def _sum_visible(emitters, panel, lobe, point, normal, view, finish, horizons, f
     return radiance
 
 
-@nb.njit(inline='always', **FAST)
+@nb.njit(forceinline=True, **FAST)
 def _extent(point, normal, corners, panel):  # type: ignore[no-untyped-def]
     """A panel as seen from a point; all extremes are at its corners.
 
@@ -126,7 +126,7 @@ def _extent(point, normal, corners, panel):  # type: ignore[no-untyped-def]
     return behind, lowest, rise / nearest, left, right
 
 
-@nb.njit(inline='always', **FAST)
+@nb.njit(forceinline=True, **FAST)
 def _radiance(point, slope, albedo, gloss, lobe, coarse, coarse_panel, fine, fine_panel, corners,  # type: ignore[no-untyped-def]
               surface, narrow, wide, huge, frame, standoff, horizons):
     """Radiance towards the camera of one point, see :func:`shade`.

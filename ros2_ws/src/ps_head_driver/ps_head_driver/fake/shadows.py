@@ -59,7 +59,7 @@ def shadow_ground(grid: NDArray, top: float, x0: float, y0: float,
     return surface, *roofs, (top, x0, y0, pitch)
 
 
-@nb.njit(inline='always', **FAST)
+@nb.njit(forceinline=True, **FAST)
 def _clear_until(roofs, t, x, y, z, i, j, dx, dy, tangent, inverse_x, inverse_y, x0, y0, side):  # type: ignore[no-untyped-def]
     """Where the line leaves block (i, j), and whether it stays above the block's roof."""
     edge_x = x0 + (i + (1 if dx > 0.0 else 0)) * side
@@ -71,7 +71,7 @@ def _clear_until(roofs, t, x, y, z, i, j, dx, dy, tangent, inverse_x, inverse_y,
     return leave, min(start + t * slope, start + leave * slope) > 0.0
 
 
-@nb.njit(inline='always', **FAST)
+@nb.njit(forceinline=True, **FAST)
 def _rise(surface, x0, y0, per_pitch, x, y):  # type: ignore[no-untyped-def]
     """Height of the facets that cast shadows, held constant beyond the grid."""
     u = min(max((x - x0) * per_pitch, 0.0), surface.shape[1] - 1.001)
@@ -83,19 +83,19 @@ def _rise(surface, x0, y0, per_pitch, x, y):  # type: ignore[no-untyped-def]
     return low + (v - j) * (high - low)
 
 
-@nb.njit(inline='always', **FAST)
+@nb.njit(forceinline=True, **FAST)
 def clears_all(frame, z, tangent, t):  # type: ignore[no-untyped-def]
     """Whether a line upwards from height z is above everything from the way t on."""
     return z + t * tangent > frame[0] and tangent >= 0.0
 
 
-@nb.njit(inline='always', **FAST)
+@nb.njit(forceinline=True, **FAST)
 def nearest(frame):  # type: ignore[no-untyped-def]
     """Way from a point at which shadows begin: its own facet is the business of n.l."""
     return 1.5 * _STEP * frame[3]
 
 
-@nb.njit(**FAST)
+@nb.njit(forceinline=True, **FAST)
 def horizon(surface, narrow, wide, huge, frame, x, y, z, dx, dy, lowest, highest, guess):  # type: ignore[no-untyped-def]
     """Tangent of the elevation below which the surface hides the sky, seen from (x, y, z).
 

@@ -25,9 +25,10 @@ from ps_head_driver.stack import Truth
 
 _FREE = (6, 4)              # emitters along a panel's width and height where no shadow falls
 _PARTS = (5, 3)             # of a panel along width and height, for shadows
-# emitters in a part of the panel that is partly hidden, on a lattice of two neighbours of
-# Fibonacci's: no edge, however it lies, hides whole rows of it at once, as it would of a grid
-_LATTICE, _TURN = 21, 13
+_DISTANCE = 1.2e-3          # m; of emitters in a part that is partly hidden, at most
+# their numbers: they lie on a lattice of two neighbours of Fibonacci's, so that no edge, however
+# it lies, hides whole rows of them at once, as it would of a grid
+_FIBONACCI = (13, 21, 34, 55, 89, 144, 233, 377, 610)
 _CLEAR = 2.0                # fraction of a way at which nothing is met
 
 
@@ -365,8 +366,10 @@ class RingRenderer(Renderer):
         u, v = (grid.ravel() for grid in np.meshgrid(*(np.linspace(-0.5, 0.5, n + 1)
                                                        for n in _PARTS)))
         nodes = centre[:, None] + sides.T @ np.stack([u, v])
-        e = np.arange(_LATTICE)
-        lattice = np.stack([e, _TURN * e % _LATTICE], axis=1) / _LATTICE
+        wanted = pose.size[0] * pose.size[1] / math.prod(_PARTS) / _DISTANCE ** 2
+        n = 1 + min(int(np.searchsorted(_FIBONACCI[1:], wanted)), len(_FIBONACCI) - 2)
+        e = np.arange(_FIBONACCI[n])
+        lattice = np.stack([e, _FIBONACCI[n - 1] * e % len(e)], axis=1) / len(e)
         lobe = None if pose.lobe_exponent == 1 else pose.lobe_exponent
         with KERNEL_LOCK:
             return np.asarray(_light(

@@ -24,6 +24,7 @@ VENV = ROOT / '.venv'
 WORKSPACE = ROOT / 'ros2_ws'
 REQUIREMENTS = ROOT / 'requirements'
 LOG = ROOT / '.cache' / 'setup.log'
+KERNELS = ROOT / '.cache' / 'numba'  # as in env.sh
 OLDEST, NEWEST = (3, 11), (3, 14)  # what the ROS wheels and the pins are built for
 DISTRO = 'jazzy'
 FREE_BYTES = 2 * 1024**3
@@ -371,6 +372,20 @@ def build_workspace(ros: Path | None, base: str, fresh: bool) -> None:
     write_new(path, json.dumps(wanted))
 
 
+def forget_kernels() -> None:
+    """Remove the compiled kernels if the source of any has changed.
+
+    numba looks only at the file that a kernel is in, not at those whose kernels it calls, and
+    would go on running old code.
+    """
+    path = KERNELS / 'setup.json'
+    wanted = {'kernels': digest(*(source for source in sorted((WORKSPACE / 'src').rglob('*.py'))
+                                  if b'njit' in source.read_bytes()))}
+    if read_stamps(path) != wanted:
+        shutil.rmtree(KERNELS, ignore_errors=True)
+        write_new(path, json.dumps(wanted))
+
+
 def setup() -> None:
     """Bring `.venv` and the workspace up to date; do nothing where they are."""
     LOG.parent.mkdir(parents=True, exist_ok=True)
@@ -398,6 +413,7 @@ def setup() -> None:
             write_new(path, json.dumps({'packages': stamp, 'made_with': made_with,
                                         'python': python['executable']}))
         build_workspace(ros, made_with, fresh)
+        forget_kernels()
 
 
 def main() -> int:

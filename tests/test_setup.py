@@ -185,6 +185,25 @@ def test_stamps_follow_descriptions_not_code(tmp_path: Path,
     assert project_setup.workspace_stamps('base')['interfaces'] != before['interfaces']
 
 
+def test_kernels_are_compiled_anew_when_any_source_changed(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(project_setup, 'WORKSPACE', tmp_path)
+    monkeypatch.setattr(project_setup, 'KERNELS', tmp_path / 'numba')
+    (tmp_path / 'src').mkdir()
+    kernel, other = tmp_path / 'src' / 'kernel.py', tmp_path / 'src' / 'other.py'
+    kernel.write_text('@nb.njit(cache=True)\ndef f(x):\n    return x\n')
+    other.write_text('x = 1\n')
+    compiled = tmp_path / 'numba' / 'folder' / 'kernel.f.nbi'
+    for changed, text, kept in ((other, 'x = 2\n', True),
+                                (kernel, kernel.read_text() + '# more\n', False)):
+        project_setup.forget_kernels()
+        compiled.parent.mkdir(parents=True, exist_ok=True)
+        compiled.touch()
+        changed.write_text(text)
+        project_setup.forget_kernels()
+        assert compiled.exists() == kept
+
+
 @pytest.mark.parametrize(('finished', 'fresh', 'kept'),
                          [(True, False, True), (True, True, False), (False, False, False)])
 def test_builds_of_others_are_not_built_upon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,

@@ -261,7 +261,9 @@ def _quality(evidence: Evidence) -> dict[str, Any]:
          f'{max(float(np.max(edges)) for edges in fit.edge_px):.3f} px'),
         ('condition of the fit', f'{fit.condition:.3g}'),
         ('scatter, relative to the noise', f'{fit.scatter:.2f}'),
-        ('known over fitted height of the wall (z_scale)', f'{result.z_scale:.4f}'),
+        ('known over fitted height of the wall (z_scale)',
+         f'{result.z_scale:.4f} ± {result.z_scale_deviation:.4f}'),
+        ('light thrown by the wall, over what its reflectance says', f'{fit.glow:.2f}'),
         ('plane, tilt against the camera',
          f'{math.degrees(math.acos(min(normal[2], 1.0))):.3f}° ± '
          f'{math.degrees(known.level_deviation):.4f}°'),

@@ -14,7 +14,7 @@ from ps_calibration.catalogue import list_calibrations
 from ps_calibration.dark_field import PARAMETERS as DARK_PARAMETERS
 from ps_calibration.report import Evidence, gather, report, write_report
 from ps_calibration.ring_target import RingTarget, default_target_path, load_target
-from ps_calibration.uncertainty import dark_figures
+from ps_calibration.uncertainty import dark_figures, light_figures
 from ps_head_driver.calibration_file import write_calibration
 from ps_head_driver.errors import PsError
 from ps_head_driver.head_model import DIRECTIONS, HeadModel, load_head, nominal_head_path
@@ -65,11 +65,15 @@ def as_json(evidence: Evidence, folders: list[Path]) -> dict:
     fit, homography = result.fit, result.camera_to_plane()
     listed = []
     for k, panels in enumerate(result.panels(head)):
+        assert fit is not None
         mean = float(np.mean([panel.intensity for panel in panels]))
+        known = light_figures(fit, head, result.camera, k)
         listed.append({'folder': str(folders[k]), 'lights': [
             {'panel': name, 'position': panel.center.tolist(), 'axis': panel.axis.tolist(),
              'intensity': panel.intensity / mean,
-             'shadow_residual_px': float(fit.edge_px[k][i]) if fit else None}
+             'direction_deviation_deg': math.degrees(known.direction_deviation[i]),
+             'intensity_deviation': float(known.intensity_deviation[i]),
+             'shadow_residual_px': float(fit.edge_px[k][i])}
             for i, (name, panel) in enumerate(zip(DIRECTIONS, panels, strict=True))]})
     return {
         'verdict': result.verdict, 'reason': result.reason, 'folders': listed,

@@ -19,6 +19,7 @@ from ps_calibration.plate_light import (
     light_of,
     mean_light,
     measure_plate_light,
+    thrown_light,
 )
 from ps_calibration.ring_fit import RingFit
 from ps_calibration.ring_pictures import MOVED_PX, room_light, stated_tilt, without_room
@@ -44,6 +45,7 @@ from ps_head_driver.stack import Mode, Panel, Stack
 _PRIOR = np.array([*PANEL_PRIOR[:5], 0.5])
 _MODEL = 1e-3            # relative error expected of the model of the light
 _THIN = 4                # one block in so many gets the fit close
+_ROUNDS = 2              # of it: what the wall throws depends on where the panel is
 _DEAD = 0.3              # of the median of the four panels
 _LIKE = 0.5              # correlation of a panel's light with that as designed
 _BURNT = 0.2             # part of the plate that may be saturated
@@ -175,7 +177,7 @@ def calibrate_dark_field(stacks: Sequence[Stack], captures: Sequence[Sequence[ND
     mean = float(np.mean([panel.intensity for panel in bright]))
     bright = [replace(panel, intensity=panel.intensity / mean) for panel in bright]
     light = measure_plate_light(pictures, burnt, np.sum(captures[position][:4], axis=0), bright,
-                                fit.pose, target, camera)
+                                fit.pose, target, camera, fit.glow)
     designed = np.stack([light_of(fit.pose.panel_to_target(panel), light.points, target)
                          for panel in PanelRing(head.dark_field).poses(tilt)])
     gains = np.nansum(light.values, axis=1) / np.nansum(
@@ -189,7 +191,7 @@ def calibrate_dark_field(stacks: Sequence[Stack], captures: Sequence[Sequence[ND
                              if not reason] or [1.0]))
     panels = tuple(
         DarkPanel('FAILED', reason) if reason
-        else fit_panel(i, light, tilt, math.log(usual), fit.pose, head, target, camera)
+        else fit_panel(i, light, tilt, math.log(usual), fit, head, target, camera)
         for i, reason in enumerate(reasons))
     return DarkField(*_judge(panels), tilt, position, panels, light)
 
@@ -274,7 +276,7 @@ class _Problem:
             (x - self.start) / _PRIOR, np.diag(1 / _PRIOR))
 
 
-def fit_panel(i: int, light: PlateLight, tilt: float, usual: float, pose: TargetPose,
+def fit_panel(i: int, light: PlateLight, tilt: float, usual: float, bright: RingFit,
               head: HeadModel, target: RingTarget, camera: CameraGeometry) -> DarkPanel:
     """Fit one panel.
 
@@ -282,17 +284,21 @@ def fit_panel(i: int, light: PlateLight, tilt: float, usual: float, pose: Target
     :param light: on the plate; where a value is NaN, the block is not used.
     :param tilt: of the servo, rad.
     :param usual: logarithm of the intensity to start from.
-    :param pose: of the target.
+    :param bright: fit of the bright field: it tells the target's pose and the wall's light.
     :param head: as designed.
     """
-    place = (i, light, tilt, usual, pose, head, target)
+    place = (i, light, tilt, usual, bright.pose, head, target)
     thin, problem = _Problem(*place, part=_THIN), _Problem(*place)
-    x, _ = minimise(thin.equations, thin.start)
-    # what averaging over a block adds to the light in its middle
+    measured, x = thin.values, thin.start
+    for _ in range(_ROUNDS):
+        thin.values = measured - bright.glow * thrown_light(thin.panel(x), thin.points, target)
+        x, _ = minimise(thin.equations, x)
+    # what averaging over a block adds to the light in its middle, and what the wall throws there
     known = np.isfinite(light.values[i])
     panel = problem.panel(x)
     problem.values = problem.values - (
-        mean_light(panel, light.corners, target)[known] - light_of(panel, problem.points, target))
+        mean_light(panel, light.corners, target)[known] - light_of(panel, problem.points, target)
+    ) - bright.glow * thrown_light(panel, problem.points, target)
     x, equations = minimise(problem.equations, x)
     panel, left = problem.panel(x), problem.left(x)
     scatter = max(1.4826 * float(np.median(abs(left))), 1.0)

@@ -16,6 +16,7 @@ from ps_calibration.ring_target import RingTarget
 from ps_calibration.shadow_model import plate_irradiance
 from ps_calibration.shares import plate_blocks
 from ps_calibration.target_pose import TargetPose
+from ps_calibration.wall_glow import wall_glow
 from ps_head_driver.camera_model import plane_points
 from ps_head_driver.head_model import CameraGeometry
 from ps_head_driver.kinematics import PanelPose
@@ -57,6 +58,11 @@ def mean_light(panel: PanelPose, corners: NDArray, target: RingTarget) -> NDArra
     return np.asarray(np.mean([light_of(panel, corner, target) for corner in corners], axis=0))
 
 
+def thrown_light(panel: PanelPose, points: NDArray, target: RingTarget) -> NDArray:
+    """What the wall throws onto the plate of it, as reflective as the file says."""
+    return panel.intensity * wall_glow(points, panel, target)
+
+
 def free_light(panel: PanelPose, points: NDArray) -> NDArray:
     """The same on a plate without the ring."""
     return panel.intensity * plate_irradiance(points, panel, 0.0, np.zeros((4, 2)))
@@ -64,13 +70,15 @@ def free_light(panel: PanelPose, points: NDArray) -> NDArray:
 
 def measure_plate_light(pictures: Sequence[NDArray], burnt: Sequence[NDArray],
                         bright: NDArray, panels: Sequence[PanelPose], pose: TargetPose,
-                        target: RingTarget, camera: CameraGeometry) -> PlateLight:
+                        target: RingTarget, camera: CameraGeometry,
+                        glow: float = 0.0) -> PlateLight:
     """Divide pictures by what is known of the plate.
 
     :param pictures: four, (H, W) float, room light subtracted.
     :param burnt: four, (H, W) bool, where they are saturated.
     :param bright: sum of the pictures under E, N, W, S of the bright field, equal exposure.
     :param panels: these four as calibrated, ps_head_plane, with a mean intensity of 1.
+    :param glow: of the wall, see RingFit.
     """
     blocks = plate_blocks([*pictures, bright, *(b.astype(np.float32) for b in burnt)], pose,
                           target, camera, _BLOCK)
@@ -80,13 +88,15 @@ def measure_plate_light(pictures: Sequence[NDArray], burnt: Sequence[NDArray],
     corners = np.stack([
         _on_plate(pixels + blocks.side / math.sqrt(12) * np.array(sides), pose, camera)
         for sides in product((-1, 1), repeat=2)])
-    known = sum(mean_light(pose.panel_to_target(panel), corners, target) for panel in panels)
+    points, seen = _on_plate(pixels, pose, camera), [pose.panel_to_target(p) for p in panels]
+    known = sum(mean_light(panel, corners, target) + glow * thrown_light(panel, points, target)
+                for panel in seen)
     with np.errstate(divide='ignore', invalid='ignore'):
         ratios = blocks.means[:4] / blocks.means[4]
     values = ratios[:, used] * known
     noise = np.stack([_noise(ratio, used) for ratio in ratios]) * known
     values[blocks.means[5:][:, used] > 0] = math.nan
-    return PlateLight(pixels, _on_plate(pixels, pose, camera), corners, values, noise)
+    return PlateLight(pixels, points, corners, values, noise)
 
 
 def _on_plate(pixels: NDArray, pose: TargetPose, camera: CameraGeometry) -> NDArray:

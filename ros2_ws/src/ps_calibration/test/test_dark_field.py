@@ -68,13 +68,13 @@ def test_panels_are_found_where_they_are(
 
 def test_where_no_shadow_is_seen_the_fall_off_over_the_plate_tells(
         result: Calibration, bench: Bench, target: RingTarget, nominal: HeadModel) -> None:
-    dark, pose = result.dark, result.fit.pose
+    dark, fit, pose = result.dark, result.fit, result.fit.pose
     free = [free_light(pose.panel_to_target(panel), dark.light.points)
             for panel in dark.poses(nominal)]
     lit = np.stack([light_of(pose.panel_to_target(panel), dark.light.points, target)
                     for panel in dark.poses(nominal)]) > 0.999 * np.stack(free)
     unshaded = replace(dark.light, values=np.where(lit, dark.light.values, np.nan))
-    panels = tuple(fit_panel(i, unshaded, dark.tilt, 0.0, pose, nominal, target, result.camera)
+    panels = tuple(fit_panel(i, unshaded, dark.tilt, 0.0, fit, nominal, target, result.camera)
                    for i in range(4))
     assert {panel.source for panel in panels} == {'plate'}
     errors = dark_errors(replace(dark, panels=panels).corrected(nominal), bench)

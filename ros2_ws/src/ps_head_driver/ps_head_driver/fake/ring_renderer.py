@@ -160,24 +160,17 @@ def _look(origin, rays, ring, ends, slits, plate, dots, dot_radius, reflectance,
 
     :returns: (N, 4): point, reflectance.
     """
-    out = np.zeros((rays.shape[0], 4))
+    out = np.empty((rays.shape[0], 4))
     height = ring[2]
     for k in nb.prange(rays.shape[0]):
         foot = -origin[2] / rays[k, 2]
         crown = (height - origin[2]) / rays[k, 2]
-        x, y = origin[0] + crown * rays[k, 0], origin[1] + crown * rays[k, 1]
+        x, y, z = origin[0] + crown * rays[k, 0], origin[1] + crown * rays[k, 1], height
         dx, dy = (foot - crown) * rays[k, 0], (foot - crown) * rays[k, 1]
         met = _meets(x, y, dx, dy, ring, ends, slits) if height > 0.0 else _CLEAR
-        if met == 0.0:
-            out[k] = np.array([x, y, height, reflectance[0]])
-        elif met < 1.0:
-            # the wall's own shading is of no use to anybody: give it that of a level face; a
-            # little in front of it, so that it does not shadow itself by chance
-            met -= 1e-6
-            out[k] = np.array([x + met * dx, y + met * dy, height * (1.0 - met),
-                               0.5 * reflectance[0]])
-        else:
-            x, y = x + dx, y + dy
+        albedo = reflectance[0]
+        if met == _CLEAR:
+            x, y, z = x + dx, y + dy, 0.0
             albedo = reflectance[1]
             if abs(x) > plate[0] / 2 or abs(y) > plate[1] / 2:
                 albedo = 0.0
@@ -186,7 +179,13 @@ def _look(origin, rays, ring, ends, slits, plate, dots, dot_radius, reflectance,
                 beyond = math.hypot(x - dots[d, 0], y - dots[d, 1]) - dot_radius
                 part = min(max(0.5 - beyond / pixel, 0.0), 1.0)
                 albedo += part * (reflectance[2] - albedo)
-            out[k] = np.array([x, y, 0.0, albedo])
+        elif met > 0.0:
+            # the wall's own shading is of no use to anybody: give it that of a level face; a
+            # little in front of it, so that it does not shadow itself by chance
+            met -= 1e-6
+            x, y, z = x + met * dx, y + met * dy, height * (1.0 - met)
+            albedo *= 0.5
+        out[k, 0], out[k, 1], out[k, 2], out[k, 3] = x, y, z, albedo
     return out
 
 

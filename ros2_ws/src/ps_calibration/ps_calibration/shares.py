@@ -18,9 +18,9 @@ from ps_head_driver.head_model import CameraGeometry
 # what is expected of the models of soft shadows near the wall and of the smooth rest
 _MODEL_NEAR, _MODEL_FAR = 5e-4, 5e-5
 _CLEAR = 0.0006          # m; the camera looks past the wall's edge, and a block has a width
-_BLOCK = 1.6e-4          # m on the plate, edge of the smallest blocks of pixels
+_BLOCK = 3.2e-4          # m on the plate, edge of the blocks of pixels
 _REACH = 0.006           # m; no shadow is longer
-_PART, _FAR = 3, 6       # one block in _PART is used up to there; beyond, _FAR x _FAR are averaged
+_FAR = 3                 # beyond, so many x so many blocks are averaged
 
 
 @dataclass(frozen=True)
@@ -79,13 +79,12 @@ class PlateBlocks:
 
 
 def plate_blocks(pictures: Sequence[NDArray], pose: TargetPose, target: RingTarget,
-                 camera: CameraGeometry, length: float = _BLOCK) -> PlateBlocks:
+                 camera: CameraGeometry) -> PlateBlocks:
     """Average pictures over blocks, and find those where only the plate is seen.
 
     :param pictures: (H, W) float each.
-    :param length: of the blocks on the plate, m; at least a pixel.
     """
-    side = max(1, round(length * camera.fx / camera.camera_standoff))
+    side = max(1, round(_BLOCK * camera.fx / camera.camera_standoff))
     rows, columns = (n // side for n in pictures[0].shape)
     means = np.stack([
         p[:rows * side, :columns * side].reshape(rows, side, columns, side).mean(axis=(1, 3))
@@ -113,10 +112,8 @@ def measure_shares(pictures: Sequence[NDArray], tilt: float, pose: TargetPose,
     blocks = plate_blocks(pictures, pose, target, camera)
     distance = blocks.distance
     grid = np.concatenate([blocks.means, blocks.pixels])
-    i, j = np.indices(distance.shape)
     parts = []
-    for size, here in ((1, (distance < _REACH) & ((i + j) % _PART == 0)),
-                       (_FAR, distance >= _REACH)):
+    for size, here in ((1, distance < _REACH), (_FAR, distance >= _REACH)):
         whole = _merge(here[None], size)[0] == 1
         parts.append(_merge(grid, size)[:, whole])
     merged = np.concatenate(parts, axis=1)

@@ -136,7 +136,7 @@ def _summary(problem: RingProblem, x: NDArray, equations: NormalEquations) -> Ri
     strengths = np.sqrt(np.linalg.eigvalsh(known.correlation())[::-1].clip(min=1e-30))
     return RingFit(x[:4 * PER_PANEL].reshape(4, PER_PANEL).copy(),
                    [problem.tilt(x, k) for k in range(len(residuals))], problem.pose(x),
-                   float(x[-1]), 0.0, float(x[problem.softness]), float(x[problem.glow]),
+                   float(x[-1]), 0.0, float(x[problem.softness]), max(float(x[problem.glow]), 0.0),
                    residuals, edge_px, scatter,
                    known.covariance()[:problem.first_tilt, :problem.first_tilt] * scatter**2,
                    float(strengths[0] / strengths[-2]), equations)

@@ -30,6 +30,7 @@ _TILT_PRIOR = 0.03                       # rad, error of the motor between two p
 STEP = 1e-6              # m or rad, of finite differences
 _SOFTNESS_PRIOR = 1.0    # a lens that blurs as much as the blocks do
 _GLOW_PRIOR = 1.0        # a wall that is black, or twice as bright as the file says
+_DIM = 0.03              # of what the file says
 _DOT_NOISE_PX = 0.003
 # Gauss's rule over a block's edge; with two nodes it would turn all axes by 0.1 degrees
 _RULE = (-math.sqrt(0.15), 5 / 18), (0.0, 8 / 18), (math.sqrt(0.15), 5 / 18)
@@ -127,8 +128,15 @@ class RingProblem:
         self.blurs = [self._blur(x, k) for k in range(len(self.shares))]
 
     def learn_glow(self, x: NDArray) -> None:
-        """From now on, predict what light by way of the wall does near these parameters."""
-        self.glows = [self._glow(x, k) for k in range(len(self.shares))]
+        """From now on, predict what light by way of the wall does near these parameters.
+
+        A wall that is found darker than any paint throws none: what looks like a glow is then an
+        error of something else, and fitted it would turn the panels.
+        """
+        if x[self.glow] < _DIM:
+            self.expected[self.glow] = 0.0
+        else:
+            self.glows = [self._glow(x, k) for k in range(len(self.shares))]
 
     def _light(self, points: NDArray, panels: Sequence[PanelPose], height: float) -> NDArray:
         return np.stack([panel.intensity * plate_irradiance(

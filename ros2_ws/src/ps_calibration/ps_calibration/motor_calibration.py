@@ -23,7 +23,7 @@ from ps_head_driver.stack import Panel, Stack
 # three look much alike over a short range; wide, they would run away beyond it
 _PRIOR = np.array([500.0, 0.005, 0.015, 2000.0])
 _POSITIONS = 3                  # different ones, at least
-_TILT_NOISE = 1e-4              # rad, of a tilt from a ring calibration
+_TILT_NOISE = 1e-4              # rad, of a tilt from a ring calibration: at least
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,13 @@ class TiltReading:
     :param motor_counts: of the encoder.
     :param tilt: common to the four panels, as a ring calibration finds it, rad.
     :param approach: last direction of motion.
+    :param deviation: standard deviation of the tilt, rad.
     """
 
     motor_counts: int
     tilt: float
     approach: Approach = 'up'
+    deviation: float = _TILT_NOISE
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,7 @@ def calibrate_motor(readings: Sequence[TiltReading], head: HeadModel) -> MotorCa
     code = ErrorCode.CALIBRATION_BAD_REQUEST
     counts = np.array([reading.motor_counts for reading in readings], np.float64)
     tilts = np.array([reading.tilt for reading in readings])
+    noise = np.array([max(reading.deviation, _TILT_NOISE) for reading in readings])
     down = np.array([reading.approach == 'down' for reading in readings])
     if len(np.unique(counts)) < _POSITIONS:
         raise PsError(code, 'the motor needs pictures at three or more motor positions, '
@@ -122,7 +125,7 @@ def calibrate_motor(readings: Sequence[TiltReading], head: HeadModel) -> MotorCa
                           + kinematics.dtilt_dm(inside) * (wanted - inside))
 
     def residuals(x: NDArray) -> NDArray:
-        return np.concatenate([(predicted(x) - tilts) / _TILT_NOISE, x / _PRIOR])
+        return np.concatenate([(predicted(x) - tilts) / noise, x / _PRIOR])
 
     fit = least_squares(residuals, np.zeros(4), x_scale=[100.0, 1e-3, 1e-3, 100.0])
     kinematics = moved(fit.x)
@@ -150,8 +153,9 @@ def motor_of(result: Calibration, stacks: Sequence[Stack], head: HeadModel,
     if len(set(counts)) < _POSITIONS:
         return None
     sides = approaches or [None] * len(counts)
-    return calibrate_motor([TiltReading(at, tilt, side or 'up') for at, tilt, side in zip(
-        counts, result.fit.tilts, sides, strict=True)], head)
+    return calibrate_motor([
+        TiltReading(at, tilt, side or 'up', deviation) for at, tilt, side, deviation in zip(
+            counts, result.fit.tilts, sides, result.fit.tilt_deviation, strict=True)], head)
 
 
 def _kinematics(head: HeadModel, correction: MotorCorrection) -> BrightFieldKinematics:

@@ -15,7 +15,7 @@ from ps_calibration.gauss_newton import NormalEquations, minimise
 from ps_calibration.ring_problem import PER_PANEL, RingProblem, corrected
 from ps_calibration.ring_target import RingTarget
 from ps_calibration.shares import Shares
-from ps_calibration.target_pose import TargetPose
+from ps_calibration.target_pose import SIZE, TargetPose
 from ps_head_driver.head_model import CameraGeometry, HeadModel
 
 __all__ = ['PER_PANEL', 'RingFit', 'blocked_slits', 'corrected', 'fit_ring', 'free_height',
@@ -67,6 +67,14 @@ class RingFit:
         """Standard deviations of the panels' corrections, (4, PER_PANEL)."""
         own = np.diag(self.covariance)[:4 * PER_PANEL]
         return np.sqrt(own).reshape(4, PER_PANEL)
+
+
+    @property
+    def tilt_deviation(self) -> NDArray:
+        """Standard deviations of the tilts, rad; 0 of the first, which all others refer to."""
+        first = 4 * PER_PANEL + SIZE
+        own = np.diag(self.equations.first(-1).covariance())[first:first + len(self.tilts) - 1]
+        return np.concatenate([[0.0], self.scatter * np.sqrt(own)])
 
 
 def fit_ring(head: HeadModel, target: RingTarget, camera: CameraGeometry,

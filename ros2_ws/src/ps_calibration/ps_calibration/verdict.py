@@ -16,7 +16,7 @@ _Z_NOISE = 4             # standard deviations of the height, below which nothin
 _TURN = 0.3              # degrees of the lights for 1 % of the wall's height
 _NO_WALL = 0.4           # of the wall's height, below which there is none
 _BLOCKED = 0.6           # of a slit
-_SOFT = 6.0              # of the pictures, see RingFit.softness: they should be 1 or 2
+_SOFT = 3.0              # of the pictures, see RingFit.softness: it should be about 1
 _LIMIT = np.array([0.006, 0.006, 0.006, 0.07, 0.07, 0.25])
 
 

@@ -21,6 +21,7 @@ from ps_head_driver.camera_model import plane_points
 from ps_head_driver.head_model import CameraGeometry
 from ps_head_driver.kinematics import PanelPose
 
+_BLOCK = 3.2e-4          # m on the plate, edge of the blocks of pixels
 _PART, _ROW = 4, 3       # one block in so many is used, on a lattice that moves so much per row
 _FAINT = 0.05            # of the median light: below it noise falls no more
 _DARKNESS = 1e-9
@@ -80,7 +81,7 @@ def measure_plate_light(pictures: Sequence[NDArray], burnt: Sequence[NDArray],
     :param glow: of the wall, see RingFit.
     """
     blocks = plate_blocks([*pictures, bright, *(b.astype(np.float32) for b in burnt)], pose,
-                          target, camera)
+                          target, camera, _BLOCK)
     rows, columns = np.indices(blocks.distance.shape)
     used = np.isfinite(blocks.distance) & ((columns + _ROW * rows) % _PART == 0)
     pixels = blocks.pixels[:, used].T

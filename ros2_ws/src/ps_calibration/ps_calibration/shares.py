@@ -18,9 +18,9 @@ from ps_head_driver.head_model import CameraGeometry
 # what is expected of the models of soft shadows near the wall and of the smooth rest
 _MODEL_NEAR, _MODEL_FAR = 5e-4, 5e-5
 _CLEAR = 0.0006          # m; the camera looks past the wall's edge, and a block has a width
-_BLOCK = 3.2e-4          # m on the plate, edge of the blocks of pixels
+_BLOCK = 1.6e-4          # m on the plate, edge of the blocks of pixels
 _REACH = 0.006           # m; no shadow is longer
-_FAR = 3                 # beyond, so many x so many blocks are averaged
+_FAR = 6                 # beyond, so many x so many blocks are averaged
 
 
 @dataclass(frozen=True)
@@ -79,12 +79,13 @@ class PlateBlocks:
 
 
 def plate_blocks(pictures: Sequence[NDArray], pose: TargetPose, target: RingTarget,
-                 camera: CameraGeometry) -> PlateBlocks:
+                 camera: CameraGeometry, length: float = _BLOCK) -> PlateBlocks:
     """Average pictures over blocks, and find those where only the plate is seen.
 
     :param pictures: (H, W) float each.
+    :param length: of the blocks on the plate, m; at least a pixel.
     """
-    side = max(1, round(_BLOCK * camera.fx / camera.camera_standoff))
+    side = max(1, round(length * camera.fx / camera.camera_standoff))
     rows, columns = (n // side for n in pictures[0].shape)
     means = np.stack([
         p[:rows * side, :columns * side].reshape(rows, side, columns, side).mean(axis=(1, 3))

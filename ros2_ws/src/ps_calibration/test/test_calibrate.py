@@ -60,13 +60,14 @@ def test_pictures_without_noise_give_the_axes_although_their_pixels_are_averaged
     result = calibrate([pictures], target, nominal)
     assert result.verdict == 'OK'
     assert result.fit is not None
-    # the renderer looks along one ray a pixel: 3 x 3 of them have 8/9 of the variance of a block
-    assert result.fit.softness == pytest.approx(8 / 9, abs=0.06)
+    # the renderer looks along one ray a pixel: 2 x 2 of them have 3/4 of the variance of a block,
+    # and more of its effect where an edge is sharper than a block
+    assert result.fit.softness == pytest.approx(0.82, abs=0.08)
     truth = BrightFieldKinematics(bench.head)
     for found, name in zip(result.panels(nominal)[0], DIRECTIONS, strict=True):
         true = truth.panel_pose(name, truth.tilt(counts))  # type: ignore[arg-type]
         assert angular_error_deg(found.axis, true.axis) < 0.06
-        assert np.linalg.norm(found.center - true.center) < 8e-5
+        assert np.linalg.norm(found.center - true.center) < 7e-5
     assert result.z_scale == pytest.approx(1, abs=3 * result.z_scale_deviation)
 
 

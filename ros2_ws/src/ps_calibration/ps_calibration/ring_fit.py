@@ -176,5 +176,6 @@ def blocked_slits(fit: RingFit, head: HeadModel, target: RingTarget, camera: Cam
         filled = predicted(target.model_copy(update={'slits': slits}))
         change = np.concatenate([(after - before).ravel()
                                  for after, before in zip(filled, open_shares, strict=True)])
-        found.append(left @ change / (change @ change))
+        size = change @ change      # 0 if no pixel sees the slit's light
+        found.append(left @ change / size if size > 0 else 0.0)
     return np.array(found)

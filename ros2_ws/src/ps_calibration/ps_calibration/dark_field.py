@@ -19,7 +19,6 @@ from ps_calibration.plate_light import (
     light_of,
     mean_light,
     measure_plate_light,
-    thrown_light,
 )
 from ps_calibration.ring_fit import RingFit
 from ps_calibration.ring_pictures import MOVED_PX, room_light, stated_tilt, without_room
@@ -36,6 +35,7 @@ from ps_calibration.robust import soft
 from ps_calibration.shadow_model import light_and_rates
 from ps_calibration.target_pose import TargetPose
 from ps_calibration.verdict import out_of_place
+from ps_calibration.wall_glow import wall_glow
 from ps_head_driver.errors import PsError
 from ps_head_driver.head_model import DIRECTIONS, CameraGeometry, HeadModel
 from ps_head_driver.kinematics import PanelPose, PanelRing
@@ -291,14 +291,14 @@ def fit_panel(i: int, light: PlateLight, tilt: float, usual: float, bright: Ring
     thin, problem = _Problem(*place, part=_THIN), _Problem(*place)
     measured, x = thin.values, thin.start
     for _ in range(_ROUNDS):
-        thin.values = measured - bright.glow * thrown_light(thin.panel(x), thin.points, target)
+        thin.values = measured - bright.glow * wall_glow(thin.points, [thin.panel(x)], target)[0]
         x, _ = minimise(thin.equations, x)
     # what averaging over a block adds to the light in its middle, and what the wall throws there
     known = np.isfinite(light.values[i])
     panel = problem.panel(x)
     problem.values = problem.values - (
         mean_light(panel, light.corners, target)[known] - light_of(panel, problem.points, target)
-    ) - bright.glow * thrown_light(panel, problem.points, target)
+    ) - bright.glow * wall_glow(problem.points, [panel], target)[0]
     x, equations = minimise(problem.equations, x)
     panel, left = problem.panel(x), problem.left(x)
     scatter = max(1.4826 * float(np.median(abs(left))), 1.0)

@@ -58,13 +58,8 @@ def mean_light(panel: PanelPose, corners: NDArray, target: RingTarget) -> NDArra
     return np.asarray(np.mean([light_of(panel, corner, target) for corner in corners], axis=0))
 
 
-def thrown_light(panel: PanelPose, points: NDArray, target: RingTarget) -> NDArray:
-    """What the wall throws onto the plate of it, as reflective as the file says."""
-    return panel.intensity * wall_glow(points, panel, target)
-
-
 def free_light(panel: PanelPose, points: NDArray) -> NDArray:
-    """The same on a plate without the ring."""
+    """Light of a panel on a plate without the ring, (N,)."""
     return panel.intensity * plate_irradiance(points, panel, 0.0, np.zeros((4, 2)))
 
 
@@ -89,8 +84,8 @@ def measure_plate_light(pictures: Sequence[NDArray], burnt: Sequence[NDArray],
         _on_plate(pixels + blocks.side / math.sqrt(12) * np.array(sides), pose, camera)
         for sides in product((-1, 1), repeat=2)])
     points, seen = _on_plate(pixels, pose, camera), [pose.panel_to_target(p) for p in panels]
-    known = sum(mean_light(panel, corners, target) + glow * thrown_light(panel, points, target)
-                for panel in seen)
+    known = (sum(mean_light(panel, corners, target) for panel in seen)
+             + glow * wall_glow(points, seen, target).sum(axis=0))
     with np.errstate(divide='ignore', invalid='ignore'):
         ratios = blocks.means[:4] / blocks.means[4]
     values = ratios[:, used] * known

@@ -161,8 +161,7 @@ class RingProblem:
         """What the wall's light adds to the shares, (4, N)."""
         points, panels = self.points(x, position), self.panels(x, position)
         light = self._light(points, panels, x[-1])
-        whole = light + np.stack([panel.intensity * wall_glow(points, panel, self.target)
-                                  for panel in panels])
+        whole = light + wall_glow(points, panels, self.target)
         return np.asarray(whole / whole.sum(axis=0) - light / light.sum(axis=0))
 
     def predicted_and_rates(self, x: NDArray, position: int) -> tuple[NDArray, NDArray]:

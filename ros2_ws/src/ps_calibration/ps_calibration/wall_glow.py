@@ -7,6 +7,7 @@ not hide them, and throws its light onto the plate like any matt surface. Light 
 way lights the wall a second time; what comes later is left out, as is light from one face of the
 wall to another. Everything is in the target frame.
 """
+from collections.abc import Sequence
 import math
 from typing import Any
 
@@ -27,20 +28,21 @@ _OFF = 1e-7              # m in front of a face
 _FAST: dict[str, Any] = {'cache': True, 'fastmath': True, 'error_model': 'numpy'}
 
 
-def wall_glow(points: NDArray, panel: PanelPose, target: RingTarget) -> NDArray:
-    """Irradiance of the base plate by way of the wall, for a panel of radiance 1.
+def wall_glow(points: NDArray, panels: Sequence[PanelPose], target: RingTarget) -> NDArray:
+    """Irradiance of the base plate by way of the wall, for each of P panels.
 
     :param points: (N, 2) float64 on the plate, not under the wall, m.
-    :param panel: in the target frame; its intensity is not included.
+    :param panels: in the target frame.
     :param target: its reflectances are taken as they are.
-    :returns: (N,) float64.
+    :returns: (P, N) float64.
     """
     footprint, strips, cells = target.footprint, _strips(target), _cells(target)
     sent = target.base.reflectance * _PLATE**2 / math.pi
-    bare = plate_irradiance(cells, panel, target.height, footprint)
-    direct = _from_panel(strips, panel.center, panel.axis, panel.right,
-                         np.cross(panel.axis, panel.right), np.array(panel.size),
-                         panel.lobe_exponent, target.height, footprint)
+    bare = np.stack([panel.intensity * plate_irradiance(cells, panel, target.height, footprint)
+                     for panel in panels])
+    direct = np.stack([panel.intensity * _from_panel(
+        strips, panel.center, panel.axis, panel.right, np.cross(panel.axis, panel.right),
+        np.array(panel.size), panel.lobe_exponent, target.height, footprint) for panel in panels])
 
     def thrown(onto: NDArray, lit: NDArray) -> NDArray:
         """By the wall onto points of the plate, its cells lit so."""
@@ -139,29 +141,36 @@ def _exchanged(square, level, step):  # type: ignore[no-untyped-def]
 
 @nb.njit(**_FAST)
 def _from_plate(strips, cells, power, height, f):  # type: ignore[no-untyped-def]
-    """Irradiance of each strip's levels by cells of the plate, (M, _LEVELS).
+    """Irradiance of each strip's levels by cells of the plate, (P, M, _LEVELS).
 
-    :param power: of each cell per steradian.
+    :param power: (P, K) of each cell per steradian.
     """
-    out, step = np.zeros((strips.shape[0], _LEVELS)), height / _LEVELS
+    out = np.zeros((power.shape[0], strips.shape[0], _LEVELS))
+    step = height / _LEVELS
     for m in range(strips.shape[0]):
         for n in range(cells.shape[0]):
             ahead, square = _seen(cells[n, 0], cells[n, 1], strips[m], f)
             if ahead > 0.0:
                 for k in range(_LEVELS):
-                    out[m, k] += power[n] * ahead * _exchanged(square, k, step) / step
+                    part = ahead * _exchanged(square, k, step) / step
+                    for p in range(power.shape[0]):
+                        out[p, m, k] += power[p, n] * part
     return out
 
 
 @nb.njit(parallel=True, **_FAST)
 def _onto_plate(points, strips, radiance, height, f):  # type: ignore[no-untyped-def]
-    """Irradiance of points of the plate by the strips' levels, (N,)."""
-    out, step = np.zeros(points.shape[0]), height / _LEVELS
+    """Irradiance of points of the plate by the strips' levels, (P, N).
+
+    :param radiance: (P, M, _LEVELS).
+    """
+    out, step = np.zeros((radiance.shape[0], points.shape[0])), height / _LEVELS
     for n in nb.prange(points.shape[0]):
         for m in range(strips.shape[0]):
             ahead, square = _seen(points[n, 0], points[n, 1], strips[m], f)
             if ahead > 0.0:
                 for k in range(_LEVELS):
-                    out[n] += (radiance[m, k] * strips[m, 4] * ahead
-                               * _exchanged(square, k, step))
+                    part = strips[m, 4] * ahead * _exchanged(square, k, step)
+                    for p in range(radiance.shape[0]):
+                        out[p, n] += radiance[p, m, k] * part
     return out

@@ -83,11 +83,11 @@ def test_it_is_what_rays_bring(point: tuple[float, float], target: RingTarget) -
     by_plate = target.base.reflectance * _lit(
         target, plate, np.tile([0.0, 0.0, 1.0], (len(plate), 1)), draw).sum()
     expected = target.wall_reflectance * (direct.sum() + by_plate) / count
-    found = wall_glow(np.array([point]), PANEL, target)[0]
+    found = wall_glow(np.array([point]), [PANEL], target)[0, 0]
     # what is missing here came back from the wall twice
     assert found == pytest.approx(expected, rel=0.1)
 
 
 def test_a_black_wall_has_none(target: RingTarget) -> None:
     black = target.model_copy(update={'wall_reflectance': 0.0})
-    assert not wall_glow(np.array([[0.0135, 0.004]]), PANEL, black).any()
+    assert not wall_glow(np.array([[0.0135, 0.004]]), [PANEL], black).any()
